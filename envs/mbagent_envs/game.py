@@ -1,0 +1,254 @@
+"""What a game is: a few pure functions on batches of observations, with no memory of their own.
+
+An observation is the whole state. Everything random comes from keys (`mbagent_envs.random_keys`), one a row,
+so the same functions serve one environment, a thousand of them at once, and a planner that simulates with the
+true rules.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import types
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium.spaces import Discrete, MultiBinary
+
+from mbagent_envs.random_keys import KeyArray
+
+Bits = npt.NDArray[np.int8]
+"""A batch of observations, int8 ``[B, *shape]`` of zeros and ones."""
+Ints = npt.NDArray[np.int64]
+Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+RewardFn = Callable[[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]], Floats]
+"""A goal: ``reward_fn(obs [B, ...], action [B], next_obs [B, ...]) -> float64 [B]``, for any integer type."""
+
+
+def as_floats(values: Any) -> Floats:
+    """Return numbers or truth values as float64."""
+    return np.asarray(values, dtype=np.float64)
+
+
+class InvalidActionError(gym.error.InvalidAction, ValueError):
+    """An action outside the action space."""
+
+
+@dataclass(frozen=True)
+class Sprite:
+    """One thing to draw: its kind (a key of `mbagent_envs.drawing.SYMBOLS`) at a cell, row 0 on top."""
+
+    kind: str
+    row: int
+    column: int
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a picture shows: a board of cells and the things on it, painted in the order given.
+
+    ``background`` is a key of `mbagent_envs.drawing.BACKGROUNDS`.
+    """
+
+    background: str
+    rows: int
+    columns: int
+    sprites: tuple[Sprite, ...]
+
+
+class Game(ABC):
+    """The rules of a game as pure functions on batches; ``B`` below is the batch size.
+
+    Subclasses take their arguments as keywords, set the attributes below, and call ``super().__init__`` with
+    the goals. Instances are immutable in practice: nothing changes them after construction, so one may be
+    shared freely.
+    """
+
+    action_names: tuple[str, ...]
+    """What each action does, by number."""
+    observation_space: MultiBinary
+    action_space: Discrete[np.int64]
+    max_episode_steps: ClassVar[int]
+    """Steps after which an episode is truncated unless `gymnasium.make` is told otherwise."""
+
+    def __init__(
+        self,
+        *,
+        observation_shape: tuple[int, ...],
+        action_names: tuple[str, ...],
+        goals: Mapping[str, RewardFn],
+    ) -> None:
+        """Build the spaces and the mapping of goals (``"default"``, the game's own reward, comes first)."""
+        self.action_names = action_names
+        self.observation_space = MultiBinary(observation_shape)
+        self.action_space = Discrete(len(action_names))
+        self._goals: dict[str, RewardFn] = {"default": self.reward, **goals}
+
+    @property
+    def reward_functions(self) -> Mapping[str, RewardFn]:
+        """Goals by name, functions of (obs, action, next_obs); ``"default"`` is the game's own reward."""
+        return types.MappingProxyType(self._goals)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The keyword arguments with which an equal game can be built again."""
+        return {name: getattr(self, name) for name in argument_names(type(self))}
+
+    def __repr__(self) -> str:
+        """Show the game as the call that builds it."""
+        arguments = ", ".join(f"{name}={value!r}" for name, value in self.arguments.items())
+        return f"{type(self).__name__}({arguments})"
+
+    @abstractmethod
+    def initial(self, keys: KeyArray) -> Bits:
+        """Draw start states: keys uint64 ``[B]`` -> observations int8 ``[B, *shape]``."""
+
+    @abstractmethod
+    def transition(self, obs: Bits, actions: npt.NDArray[Any], keys: KeyArray) -> Bits:
+        """Take one step in every row.
+
+        Args:
+            obs: int8 ``[B, *shape]``; taken on trust (see `check_observations`).
+            actions: integers ``[B]``; taken on trust (see `check_actions`).
+            keys: uint64 ``[B]``; row ``b`` of the result depends on row ``b`` of the arguments only.
+
+        Returns:
+            A new array of the next observations, int8 ``[B, *shape]``.
+        """
+
+    @abstractmethod
+    def reward(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
+        """Return the game's own reward, float64 ``[B]``, of transitions laid out as in `transition`."""
+
+    def terminated(
+        self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]
+    ) -> Bools:
+        """Return which transitions end the episode, bool ``[B]``; by default none does."""
+        return np.zeros(len(next_obs), dtype=np.bool_)
+
+    def transition_distribution(self, obs: Bits, action: int) -> tuple[Bits, Floats]:
+        """Enumerate what may follow one observation and action.
+
+        Args:
+            obs: int8 ``[*shape]``.
+            action: number of the action.
+
+        Returns:
+            The distinct next observations, int8 ``[M, *shape]``, and their probabilities, float64 ``[M]``,
+            all positive.
+
+        Raises:
+            NotImplementedError: if the successors are too many to list.
+        """
+        raise NotImplementedError(
+            f"{type(self).__name__} cannot list its successors; sample them with transition()."
+        )
+
+    @abstractmethod
+    def scene(self, obs: Bits) -> Scene:
+        """Return what a picture of one observation, int8 ``[*shape]``, shows."""
+
+    @abstractmethod
+    def invalid(self, obs: Bits) -> str | None:
+        """Say briefly what makes a row of ``obs``, bits ``[B, *shape]``, no state of this game, or None."""
+
+    def check_observations(self, obs: npt.ArrayLike) -> Bits:
+        """Return a batch of observations as contiguous int8 ``[B, *shape]``.
+
+        Raises:
+            ValueError: if the shape is wrong or a row is no state of this game.
+        """
+        array = np.asarray(obs)
+        shape = self.observation_space.shape
+        if array.ndim != len(shape) + 1 or array.shape[1:] != shape:
+            raise ValueError(
+                f"observations must have shape (B, {', '.join(map(str, shape))}), but it is {array.shape}."
+            )
+        if not bool(np.isin(array, (0, 1)).all()):
+            raise ValueError(
+                "observations must hold only 0 and 1; pass them as the environment returned them."
+            )
+        bits = np.ascontiguousarray(array, dtype=np.int8)
+        reason = self.invalid(bits)
+        if reason is not None:
+            raise ValueError(
+                f"not a state of {type(self).__name__}: {reason}; "
+                "pass observations as the environment returned them."
+            )
+        return bits
+
+    def check_actions(self, actions: npt.ArrayLike, count: int) -> Ints:
+        """Return a batch of actions as int64 ``[count]``.
+
+        Raises:
+            InvalidActionError: if their shape, type or values are wrong.
+        """
+        array = np.asarray(actions)
+        n = int(self.action_space.n)
+        if (
+            array.dtype.kind not in "iu"
+            or array.shape != (count,)
+            or (count and (array.min() < 0 or array.max() >= n))
+        ):
+            raise InvalidActionError(
+                f"actions must be {count} integer{'s' * (count != 1)} from 0 to {n - 1} "
+                f"({', '.join(self.action_names)}), but got {actions!r}."
+            )
+        return array.astype(np.int64, copy=False)
+
+
+def argument_names(game_type: type[Game]) -> list[str]:
+    """Return the names of the keyword arguments of a game's class."""
+    return [name for name in inspect.signature(game_type).parameters if name != "self"]
+
+
+def build_game(game_type: type[Game], arguments: Mapping[str, Any]) -> Game:
+    """Build a game from keyword arguments.
+
+    Raises:
+        TypeError: if an argument is unknown; the message names the nearest known one.
+        ValueError: if a value is impossible (raised by the game itself, as TypeError is for a wrong type).
+    """
+    known = argument_names(game_type)
+    for name in arguments:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise TypeError(
+                f"{game_type.__name__} has no argument {name!r} (it takes {', '.join(known)}){hint}"
+            )
+    return game_type(**arguments)
+
+
+def check_integer(name: str, value: object, minimum: int) -> int:
+    """Return ``value`` as an int of at least ``minimum``; TypeError or ValueError name the argument."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
+        raise TypeError(f"{name} must be an integer, but it is {value!r} of type {type(value).__name__}.")
+    if value < minimum:
+        raise ValueError(f"{name} must be at least {minimum}, but it is {value}.")
+    return int(value)
+
+
+def check_number(name: str, value: object, minimum: float, maximum: float) -> float:
+    """Return ``value`` as a finite float in [minimum, maximum]; TypeError or ValueError name the argument."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise TypeError(f"{name} must be a number, but it is {value!r} of type {type(value).__name__}.")
+    if not (minimum <= value <= maximum and np.isfinite(value)):
+        wanted = (
+            f"in [{minimum:g}, {maximum:g}]" if np.isfinite([minimum, maximum]).all() else "a finite number"
+        )
+        raise ValueError(f"{name} must be {wanted}, but it is {value}.")
+    return float(value)
+
+
+def check_flag(name: str, value: object) -> bool:
+    """Return ``value`` as a bool, or raise TypeError naming the argument."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"{name} must be True or False, but it is {value!r} of type {type(value).__name__}.")
+    return bool(value)

@@ -1,0 +1,31 @@
+"""mbagent: an agent that learns how a stochastic discrete world works, and can then be given any goal.
+
+Importing this package registers the games ``mbagent/GeyserRunner-v0``, ``mbagent/Maneuverer-v0`` and
+``mbagent/FlierCatcher-v0`` with Gymnasium.
+"""
+
+import mbagent_envs
+
+from mbagent.agent import ModelLearningAgent
+from mbagent.planning.planner import PlannerSettings
+from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
+from mbagent.rewards import RewardFn
+from mbagent.spaces import ActionEnumeration, FactoredSpace
+from mbagent.transitions import TransitionBatch, TransitionDataset
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "ActionEnumeration",
+    "FactoredSpace",
+    "FlatMonteCarloPolicy",
+    "MctsPolicy",
+    "ModelLearningAgent",
+    "PlannerPolicy",
+    "PlannerSettings",
+    "RewardFn",
+    "TransitionBatch",
+    "TransitionDataset",
+    "ValueIterationPolicy",
+    "mbagent_envs",
+]

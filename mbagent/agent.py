@@ -1,0 +1,410 @@
+"""ModelLearningAgent: explore, fit, plan. The only room that knows all the others."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import get_system_info, safe_mean
+from stable_baselines3.common.vec_env import VecEnv
+
+from mbagent import persistence
+from mbagent.experience import ExperienceRecorder, distinct_rows
+from mbagent.exploration import EXPLORATIONS, Exploration
+from mbagent.goals import GoalBook
+from mbagent.learned_reward import LearnedReward
+from mbagent.models.base import FitReport, TransitionModel
+from mbagent.models.factory import build_model
+from mbagent.planning.planner import PlannerSettings
+from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
+from mbagent.rewards import RewardFn
+from mbagent.saving import load_agent, save_agent
+from mbagent.spaces import ActionEnumeration, FactoredSpace
+from mbagent.transitions import TransitionDataset
+from mbagent.wrapping import wrap_env
+
+ITERATION_STEPS = 1000
+"""Environment steps between two looks at the logger."""
+
+MAX_START_STATES = 512
+"""Start states kept for generating the reachable machine."""
+
+
+class ModelLearningAgent(BaseAlgorithm):
+    """An SB3 algorithm that learns how the world works without reward, and plans on what it learned.
+
+    ``learn`` explores at random, records transitions and fits a transition model (paper section 3). ``predict`` plans
+    on the model (section 4) towards the current goal: the environment's own reward, or whatever ``set_reward`` names.
+
+    Args:
+        policy: the planner: "MctsPolicy" (also "MlpPolicy", "CnnPolicy", "MultiInputPolicy"), "FlatMonteCarloPolicy",
+            "ValueIterationPolicy", or a subclass of PlannerPolicy.
+        env: a Gymnasium environment, an SB3 VecEnv, or a registered id; its spaces must be discrete (see FactoredSpace).
+        learning_rate: largest rate of the fit's one-cycle schedule; a function of progress is evaluated at its start.
+        reward: the goal, see RewardFn; None for the environment's own.
+        model: "auto" (structure from the space), "paper" (section 3's networks), another registered name, or a TransitionModel.
+        exploration: "auto" or "random".
+        gamma: discount of a step when planning.
+        num_simulations: simulations for each decision.
+        horizon: steps a simulation looks ahead, at most.
+        policy_kwargs: further PlannerSettings, by name.
+        stats_window_size: episodes that rollout figures in the log average over.
+        tensorboard_log: folder for TensorBoard.
+        verbose: 0 nothing, 1 the log, 2 more.
+        seed: of exploration, fit and planning; None draws one.
+        device: torch device ("auto" and "cpu" are the same: the networks are small).
+
+    Raises:
+        TypeError, ValueError: an unsupported space, an unknown name or a setting out of range, in one sentence.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MctsPolicy": MctsPolicy,
+        "MlpPolicy": MctsPolicy,
+        "CnnPolicy": MctsPolicy,
+        "MultiInputPolicy": MctsPolicy,
+        "FlatMonteCarloPolicy": FlatMonteCarloPolicy,
+        "ValueIterationPolicy": ValueIterationPolicy,
+    }
+    policy: PlannerPolicy
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 0.01,
+        *,
+        reward: RewardFn | None = None,
+        model: str | TransitionModel = "auto",
+        exploration: str | Exploration = "auto",
+        gamma: float = 0.99,
+        num_simulations: int = 64,
+        horizon: int = 20,
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: torch.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        """See the class."""
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device="cpu" if device == "auto" else device,
+            support_multi_env=True,
+            seed=seed,
+        )
+        if not issubclass(self.policy_class, PlannerPolicy):
+            raise TypeError(f"policy must be a planner policy such as 'MctsPolicy', got {self.policy_class.__name__}.")
+        self.model_name: str | TransitionModel = model
+        self.exploration_name: str | Exploration = exploration
+        self.gamma, self.num_simulations, self.horizon = gamma, num_simulations, horizon
+        self.fit_report: FitReport | None = None
+        self._custom_reward = reward
+        self._planning_seed = seed if seed is not None else int(np.random.SeedSequence().generate_state(1)[0] >> 1)
+        self._recorder: ExperienceRecorder | None = None
+        self._rng = np.random.default_rng(self._planning_seed)
+        if _init_setup_model:
+            self._setup_model()
+
+    # ------------------------------------------------------------------ parts
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        return wrap_env(env, verbose, monitor_wrapper)
+
+    @property
+    def model(self) -> TransitionModel:
+        """The transition model."""
+        return self.policy.transition_model
+
+    def _settings(self) -> PlannerSettings:
+        try:
+            return PlannerSettings(
+                num_simulations=self.num_simulations,
+                gamma=self.gamma,
+                horizon=self.horizon,
+                seed=self._planning_seed,
+                **self.policy_kwargs,
+            )
+        except TypeError as error:
+            known = sorted(set(PlannerSettings.__dataclass_fields__) - {"num_simulations", "gamma", "horizon", "seed"})
+            raise TypeError(f"policy_kwargs takes {', '.join(known)}: {error}.") from error
+
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        settings = self._settings()
+        space, actions = FactoredSpace(self.observation_space), ActionEnumeration(self.action_space)
+        model = self.model_name
+        if isinstance(model, str):
+            model = build_model(model, space, actions.n, self.lr_schedule(1.0))
+        elif tuple(model.cardinalities) != space.cardinalities or model.n_actions != actions.n:
+            raise ValueError(
+                f"The model has {len(model.cardinalities)} factors and {model.n_actions} actions, but the environment "
+                f"{len(space)} and {actions.n}; build the model for this environment's spaces."
+            )
+        reward_model = LearnedReward(space.cardinalities, actions.n, space.planes, seed=self._planning_seed)
+        policy = self.policy_class(
+            self.observation_space,
+            self.action_space,
+            self.lr_schedule,
+            model=model,
+            reward_model=reward_model,
+            settings=settings,
+        )
+        assert isinstance(policy, PlannerPolicy)
+        self.policy = policy
+        self._explorer = self._build_exploration(actions.n)
+        self.transitions = TransitionDataset(space.cardinalities, actions.n)
+        self.goals = GoalBook(policy, self.transitions)
+        if self.env is not None:
+            self.goals.take_environment(self.env)
+        start_states = getattr(model, "start_states", None)
+        if start_states is not None:  # a model that needs no learning, such as the true simulator
+            policy.start_states = distinct_rows(start_states(MAX_START_STATES))
+            policy.fitted = True
+        self.set_reward(self._custom_reward) if self._custom_reward is not None else self._refresh()
+
+    def _build_exploration(self, n_actions: int) -> Exploration:
+        if not isinstance(self.exploration_name, str):
+            return self.exploration_name
+        if self.exploration_name not in EXPLORATIONS:
+            raise ValueError(f"exploration must be one of {sorted(EXPLORATIONS)}, got {self.exploration_name!r}.")
+        return EXPLORATIONS[self.exploration_name](n_actions)
+
+    # ------------------------------------------------------------------ goals
+
+    def set_reward(self, reward: RewardFn | None) -> None:
+        """Changes the goal; nothing is learned anew and no weight of the transition model changes.
+
+        Args:
+            reward: see RewardFn; None for the environment's own reward (or the learned one, see ``goals``).
+
+        Raises:
+            TypeError, ValueError: the function does not return one finite number a transition; the old goal stays.
+        """
+        self.policy.set_goal(self.goals.choose(reward))
+
+    def _refresh(self) -> None:
+        """Drops every planning cache and works the goal out anew."""
+        self.policy.goal = None
+        self.policy.refresh()
+        if self.policy.fitted:
+            self.policy.set_goal(self.goals.current())
+
+    # ------------------------------------------------------------------ learn
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 10,
+        tb_log_name: str = "ModelLearningAgent",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Explores for ``total_timesteps`` steps, then fits the model to everything met so far.
+
+        A run stopped by a callback still fits what it has. Called again, it goes on: transitions are kept.
+
+        Args:
+            total_timesteps: environment steps, over all copies of the environment.
+            callback: SB3 callbacks, called at every step.
+            log_interval: iterations (of 1,000 steps) between two entries in the log; None for none.
+            tb_log_name: name of the run in TensorBoard.
+            reset_num_timesteps: False counts on from the last call.
+            progress_bar: shows one (needs ``pip install "mbagent[progress]"``).
+        """
+        if self.env is None:
+            raise ValueError("learn() needs an environment; give one with set_env(env) or load(path, env=env).")
+        fresh_start = reset_num_timesteps or self._last_obs is None or self._recorder is None
+        total, callbacks = self._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        if fresh_start or self._recorder is None:
+            self._recorder = ExperienceRecorder(self.policy.factored, self.transitions, self.n_envs)
+            self._recorder.reset(self._last_obs)
+        callbacks.on_training_start(locals(), globals())
+        going, iteration = True, 0
+        while going and self.num_timesteps < total:
+            going = self._explore(min(total, self.num_timesteps + ITERATION_STEPS), callbacks, self._recorder)
+            iteration += 1
+            self._update_current_progress_remaining(self.num_timesteps, max(total, 1))
+            if log_interval is not None and iteration % log_interval == 0:
+                self._log_rollout()
+                self.logger.dump(self.num_timesteps)
+        self._recorder.flush()
+        if len(self.transitions):
+            self._fit(self._recorder)
+            if log_interval is not None:
+                self._log_rollout()
+                self.logger.dump(self.num_timesteps)
+        callbacks.on_training_end()
+        return self
+
+    def _explore(self, until: int, callback: BaseCallback, recorder: ExperienceRecorder) -> bool:
+        """Steps all environments until ``num_timesteps`` reaches ``until``; False if a callback stopped it."""
+        env = self.env
+        assert env is not None
+        callback.on_rollout_start()
+        while self.num_timesteps < until:
+            assert recorder.states is not None
+            indices = self._explorer.act(recorder.states, self._rng)
+            actions = self.policy.actions.decode(indices)
+            new_obs, rewards, dones, infos = env.step(actions)
+            self.num_timesteps += env.num_envs
+            if self._vec_normalize_env is not None:
+                new_obs, rewards = self._vec_normalize_env.get_original_obs(), self._vec_normalize_env.get_original_reward()
+            recorder.record(indices, new_obs, rewards, dones, infos)
+            self._last_obs, self._last_episode_starts = new_obs, dones
+            self._update_info_buffer(infos, dones)
+            self._episode_num += int(dones.sum())
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+        callback.on_rollout_end()
+        return True
+
+    def _fit(self, recorder: ExperienceRecorder) -> None:
+        """Fits the model, then works out goal and machine."""
+        report = self.model.fit(self.transitions, seed=self._planning_seed)
+        self._n_updates += 1
+        self.fit_report = report
+        starts = np.concatenate([self.policy.start_states, recorder.starts()])
+        self.policy.start_states = distinct_rows(starts)[:MAX_START_STATES]
+        self.policy.fitted = True
+        self.goals.forget_learned()
+        began = time.perf_counter()
+        self._refresh()
+        record = self.logger.record
+        losses = {"predictor_loss": report.predictor_loss, "conditioner_loss": report.conditioner_loss}
+        for name, value in {**losses, "exact_match": report.exact_match, "epochs": report.epochs}.items():
+            if value is not None:
+                record(f"train/{name}", value)
+        record("train/n_updates", self._n_updates, exclude="tensorboard")
+        record("train/fit_seconds", report.seconds)
+        record("model/transitions", len(self.transitions))
+        record("model/start_states", len(self.policy.start_states))
+        for name, value in report.log.items():
+            record(f"model/{name}", value)
+        if len(self.policy.start_states):
+            plan = self.policy.plan(self.policy.start_states[:1])
+            record("plan/start_value", float(plan.values.max()))
+            record("plan/first_seconds", time.perf_counter() - began)
+            record("plan/goal", self.goals.source)
+
+    def _log_rollout(self) -> None:
+        seconds = max((time.time_ns() - self.start_time) / 1e9, 1e-9)
+        if self.ep_info_buffer:
+            self.logger.record("rollout/ep_rew_mean", safe_mean([info["r"] for info in self.ep_info_buffer]))
+            self.logger.record("rollout/ep_len_mean", safe_mean([info["l"] for info in self.ep_info_buffer]))
+        if self.ep_success_buffer:
+            self.logger.record("rollout/success_rate", safe_mean(self.ep_success_buffer))
+        self.logger.record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / seconds))
+        self.logger.record("time/time_elapsed", int(seconds), exclude="tensorboard")
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+
+    def save_transitions(self, path: str) -> None:
+        """Writes what was experienced as an ``.npz`` of plain arrays (see TransitionDataset.save)."""
+        self.transitions.save(path)
+
+    def load_transitions(self, path: str) -> None:
+        """Takes transitions from a file into this agent's experience; the next ``learn`` fits to them too.
+
+        Raises:
+            ValueError: they come from another kind of environment; nothing is changed then.
+        """
+        loaded = TransitionDataset.load(path)
+        self.transitions.take(loaded)
+
+    # ------------------------------------------------------------------ files
+
+    def save(  # type: ignore[override]
+        self, path: persistence.Target, exclude: Sequence[str] | None = None, include: Sequence[str] | None = None
+    ) -> None:
+        """Writes settings, weights, start states and the learned reward to a zip that holds no code (see persistence).
+
+        Args:
+            path: a path (".zip" is added where there is no suffix) or an open binary file.
+            exclude: accepted as in SB3; nothing here can be left out.
+            include: ``["transitions"]`` adds what was experienced.
+
+        Raises:
+            ValueError: the model or the exploration is an object that a file cannot rebuild.
+        """
+        del exclude
+        save_agent(self, path, include or ())
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls,
+        path: persistence.Target,
+        env: GymEnv | None = None,
+        device: torch.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        *,
+        reward: RewardFn | None = None,
+        **kwargs: Any,
+    ) -> Self:
+        """The agent that ``save`` wrote; no code in the file is ever run.
+
+        Args:
+            path: where it was written.
+            env: a new environment, with the same spaces.
+            device: torch device.
+            custom_objects: accepted as in SB3; files hold no objects that could be replaced.
+            print_system_info: accepted as in SB3.
+            force_reset: whether ``learn`` starts with a reset.
+            reward: the goal; needed again if it was a custom one.
+            **kwargs: constructor arguments that override the saved ones.
+
+        Raises:
+            FileNotFoundError, ValueError: no such file, or no saved agent.
+        """
+        del custom_objects
+        if print_system_info:
+            get_system_info()
+        return load_agent(cls, path, env, reward, force_reset, {"device": device, **kwargs})
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | Mapping[str, Any],  # type: ignore[override]
+        exact_match: bool = True,
+        device: torch.device | str = "auto",
+    ) -> None:
+        """Takes weights from a saved agent or from ``get_parameters``; planning caches are dropped, the goal stays."""
+        params = load_path_or_dict
+        if not isinstance(params, Mapping):
+            params = {"policy": persistence.read(os.fspath(params))[1]["policy"]}
+        super().set_parameters(dict(params), exact_match, device)
+        self._refresh()
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Changes the environment (same spaces); without a custom reward the goal becomes the new environment's."""
+        super().set_env(env, force_reset)
+        assert self.env is not None
+        self._recorder = None
+        self.goals.take_environment(self.env)
+        self._refresh()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "policy", "transitions", "goals"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy"], []

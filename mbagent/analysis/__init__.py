@@ -1,0 +1,1 @@
+"""Measurements: evaluation in batches, statistics, baselines, the comparison of agents and its report."""

@@ -1,0 +1,131 @@
+"""The comparison: which agents learn what for how long, and how they score."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from mbagent.analysis.cases import CASES, Case, find_case
+from mbagent.analysis.jobs import Job, all_goals
+from mbagent.analysis.records import (
+    AGENT,
+    LEARNED_REWARD,
+    RANDOM,
+    REFERENCE,
+    TRUE_MODEL,
+    Record,
+    read_records,
+)
+from mbagent.analysis.runner import run_jobs
+
+BASELINES = ("PPO", "DQN", "A2C")
+_COST = {"DQN": 4.0, "PPO": 2.0, "A2C": 1.5, AGENT: 6.0, LEARNED_REWARD: 3.0, TRUE_MODEL: 5.0, REFERENCE: 4.5}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How thorough a comparison is.
+
+    Attributes:
+        steps: environment steps for learning (fewer where a case says so).
+        seeds: independent trainings of each learning agent.
+        episodes: reporting episodes for each training.
+        baseline_multiples: the baselines train for these multiples of the steps.
+        curve_steps: the agent is also trained afresh for so many steps, for its learning curve.
+        curve_seeds: trainings for each of these points.
+        goal_seeds: trainings on which the change-of-goal experiment is run.
+        scale_episodes: episodes from which random play and references are measured.
+        cases: keys of the cases.
+    """
+
+    steps: int = 50_000
+    seeds: int = 3
+    episodes: int = 40
+    baseline_multiples: tuple[int, ...] = (1,)
+    curve_steps: tuple[int, ...] = (1_000, 5_000, 20_000)
+    curve_seeds: int = 1
+    goal_seeds: int = 1
+    scale_episodes: int = 1000
+    cases: tuple[str, ...] = tuple(case.key for case in CASES)
+
+
+QUICK = Settings()
+FULL = Settings(seeds=5, episodes=100, baseline_multiples=(1, 10), curve_seeds=5, goal_seeds=5)
+
+
+def plan_jobs(settings: Settings) -> list[Job]:
+    """All pieces of work, the longest first."""
+    jobs: list[Job] = []
+    for case in map(find_case, settings.cases):
+        steps = case.steps(settings.steps)
+        # A game without batched rules is small: many episodes of its all-or-nothing returns cost little.
+        episodes = settings.episodes if case.reward_given else 20 * settings.episodes
+        jobs.append(Job(REFERENCE, case.key, 0, 0, settings.scale_episodes, all_goals(case)))
+        for seed in range(settings.seeds):
+            goals = all_goals(case) if seed < settings.goal_seeds else ("default",)
+            jobs += _jobs_of_seed(settings, case, seed, steps, episodes, goals)
+    return sorted(jobs, key=lambda job: -_COST.get(job.agent, 0.0) * max(job.steps, settings.steps))
+
+
+def _jobs_of_seed(
+    settings: Settings, case: Case, seed: int, steps: int, episodes: int, goals: tuple[str, ...]
+) -> list[Job]:
+    jobs = [
+        Job(RANDOM, case.key, seed, 0, episodes, goals),
+        Job(LEARNED_REWARD, case.key, seed, steps, episodes),
+    ]
+    if case.reward_given:
+        jobs.append(Job(AGENT, case.key, seed, steps, episodes, goals))
+        jobs.append(Job(TRUE_MODEL, case.key, seed, 0, episodes, goals))
+    jobs += [
+        Job(name, case.key, seed, steps * multiple, episodes)
+        for name in BASELINES
+        for multiple in settings.baseline_multiples
+    ]
+    if seed < settings.curve_seeds:
+        agent = AGENT if case.reward_given else LEARNED_REWARD
+        jobs += [
+            Job(agent, case.key, seed, fewer, episodes, curve=True)
+            for fewer in settings.curve_steps
+            if fewer < steps
+        ]
+    return jobs
+
+
+def run(
+    settings: Settings, folder: Path, *, workers: int, console: Console, resume: bool = False
+) -> list[Record]:
+    """Runs a comparison, keeping every job's records in ``folder / "records"`` as soon as it is done.
+
+    Args:
+        settings: how thorough.
+        folder: where results go.
+        workers: number of processes.
+        console: where progress is shown.
+        resume: go on with an interrupted run instead of starting anew.
+
+    Raises:
+        ValueError: ``resume`` with other settings than those of the interrupted run.
+        JobsFailedError: see ``run_jobs``.
+    """
+    kept, noted = folder / "records", folder / "records" / "settings.json"
+    text = json.dumps(asdict(settings), indent=1)
+    if resume and noted.exists() and noted.read_text(encoding="utf-8") != text:
+        raise ValueError(
+            f"The run kept in {kept} had other settings; give the same ones, or leave out --resume."
+        )
+    if not resume and kept.exists():
+        shutil.rmtree(kept)
+    kept.mkdir(parents=True, exist_ok=True)
+    noted.write_text(text, encoding="utf-8")
+    return run_jobs(plan_jobs(settings), kept, workers=workers, console=console)
+
+
+def load(folder: Path) -> list[Record]:
+    """The records kept by an earlier ``run``."""
+    files = sorted((folder / "records").glob("*.json"))
+    return [record for file in files if file.name != "settings.json" for record in read_records(file)]

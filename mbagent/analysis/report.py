@@ -1,0 +1,108 @@
+"""One self-contained HTML page that explains a comparison to a newcomer."""
+
+from __future__ import annotations
+
+import base64
+import math
+import platform
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from mbagent.analysis.baselines import SETTINGS
+from mbagent.analysis.cases import Case, game_of
+from mbagent.analysis.comparison import Settings
+from mbagent.analysis.plots import colour_of, draw_curves, draw_game, draw_scores
+from mbagent.analysis.records import AGENT, LEARNED_REWARD
+from mbagent.analysis.statistics import Interval
+from mbagent.analysis.summary import CaseResult
+
+_SHOWN_VERSIONS = ("gymnasium", "stable-baselines3", "torch", "numpy", "numba")
+
+
+def write_report(
+    path: Path, results: Sequence[CaseResult], settings: Settings, *, command: str, minutes: float
+) -> None:
+    """Writes the page, pictures and all, into one file.
+
+    Args:
+        path: the file.
+        results: what ``summarise`` returned.
+        settings: those of the comparison.
+        command: the command line that makes this page again.
+        minutes: wall time of the whole comparison.
+    """
+    environment = Environment(
+        loader=PackageLoader("mbagent.analysis", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(
+        number=format_number, interval=format_interval, embedded=_embedded, colour=colour_of
+    )
+    page = environment.get_template("report.html.jinja").render(
+        results=results,
+        settings=settings,
+        command=command,
+        minutes=minutes,
+        scores=draw_scores(results),
+        curves=draw_curves(results),
+        pictures={result.case.key: _picture(result.case) for result in results},
+        headline=_headline(results),
+        baseline_settings={name: _words(options) for name, options in SETTINGS.items()},
+        versions={name: metadata.version(name) for name in _SHOWN_VERSIONS},
+        python=platform.python_version(),
+        date=datetime.now(tz=UTC).strftime("%Y-%m-%d"),
+        agents={"agent": AGENT, "learned_reward": LEARNED_REWARD},
+        arguments={result.case.key: _words(result.case.kwargs) for result in results},
+    )
+    path.write_text(page, encoding="utf-8")
+
+
+def format_number(value: float, digits: int = 2) -> str:
+    """A number for a table: a true minus sign, an en dash for what was not measured."""
+    if math.isnan(value):
+        return "–"
+    text = f"{value:,.{digits}f}"
+    if float(text.replace(",", "")) == 0:
+        text = text.lstrip("-")
+    return text.replace("-", "−")
+
+
+def format_interval(interval: Interval, digits: int = 2) -> str:
+    """The ends of an interval for a table."""
+    if math.isnan(interval.low):
+        return ""
+    return f"{format_number(interval.low, digits)} … {format_number(interval.high, digits)}"
+
+
+def _embedded(png: bytes) -> str:
+    """A picture as a data address, so that the page needs no other file."""
+    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+
+
+def _picture(case: Case) -> bytes | None:
+    """A picture of the case, where it is one of this package's games."""
+    return draw_game(case) if game_of(case) is not None else None
+
+
+def _words(options: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name}={value!r}" for name, value in options.items())
+
+
+def _headline(results: Sequence[CaseResult]) -> list[tuple[str, Interval]]:
+    """Each case with the score of the agent of this package, given the reward where it may have it."""
+    found = []
+    for result in results:
+        for name in (AGENT, LEARNED_REWARD):
+            scores = [row.score for row in result.rows if row.agent == name]
+            if scores:
+                found.append((result.case.title, scores[0]))
+                break
+    return found

@@ -1,0 +1,107 @@
+"""Normalised returns and interquartile means with stratified bootstrap intervals.
+
+The interquartile mean over runs and its bootstrap are those of Agarwal et al. 2021, "Deep Reinforcement
+Learning at the Edge of the Statistical Precipice". A run is one seed (one training); its score is the mean
+over its episodes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate with its confidence interval.
+
+    Attributes:
+        estimate: the interquartile mean.
+        low: lower end of the interval.
+        high: upper end of the interval.
+    """
+
+    estimate: float
+    low: float
+    high: float
+
+
+def normalised(returns: ArrayLike, random: float, reference: float) -> Floats:
+    """Return on a scale on which random play is 0 and the reference is 1.
+
+    Args:
+        returns: returns of any shape.
+        random: mean return of the random policy.
+        reference: mean return of the reference, the exact optimum where it can be computed.
+
+    Returns:
+        Float array of the same shape.
+
+    Raises:
+        ValueError: the reference does not beat random play, so there is no scale.
+    """
+    if not reference > random:
+        raise ValueError(
+            f"The reference ({reference:g}) has to beat random play ({random:g}) to normalise with; "
+            "choose another reference or another goal."
+        )
+    return (np.asarray(returns, dtype=np.float64) - random) / (reference - random)
+
+
+def interquartile_mean(values: ArrayLike) -> Floats:
+    """Mean of the middle half along the last axis: a quarter, rounded down, is cut off at each end.
+
+    Args:
+        values: floats [..., N].
+
+    Returns:
+        Float array [...]; with fewer than four values it is the plain mean.
+
+    Raises:
+        ValueError: no values.
+    """
+    ordered = np.sort(np.asarray(values, dtype=np.float64), axis=-1)
+    n = ordered.shape[-1] if ordered.ndim else 0
+    if n == 0:
+        raise ValueError("The interquartile mean needs at least one value along the last axis.")
+    cut = n // 4
+    return np.asarray(ordered[..., cut : n - cut].mean(axis=-1))
+
+
+def interquartile_interval(
+    scores: ArrayLike, *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0
+) -> Interval:
+    """Interquartile mean over runs, with a percentile bootstrap interval stratified by run.
+
+    Each resample draws runs with replacement and, inside every run drawn, episodes with replacement, so that
+    the interval holds both what differs between trainings and the luck of the evaluation. With a single run
+    only the latter can be seen.
+
+    Args:
+        scores: floats [runs, episodes].
+        confidence: probability mass of the interval, between 0 and 1.
+        resamples: number of bootstrap resamples.
+        seed: seed of the resampling; equal seeds give equal intervals.
+
+    Raises:
+        ValueError: not a matrix with at least one entry, or a confidence outside (0, 1).
+    """
+    matrix = np.asarray(scores, dtype=np.float64)
+    if matrix.ndim != 2 or matrix.size == 0:
+        raise ValueError(
+            f"Scores need the shape [runs, episodes] with at least one entry, not {matrix.shape}."
+        )
+    if not 0 < confidence < 1:
+        raise ValueError(f"The confidence is a probability between 0 and 1, not {confidence}.")
+    runs, episodes = matrix.shape
+    rng = np.random.default_rng(seed)
+    drawn_runs = rng.integers(runs, size=(resamples, runs, 1))
+    drawn_episodes = rng.integers(episodes, size=(resamples, runs, episodes))
+    replicates = interquartile_mean(matrix[drawn_runs, drawn_episodes].mean(axis=2))
+    tail = (1 - confidence) / 2
+    low, high = np.quantile(replicates, [tail, 1 - tail])
+    return Interval(float(interquartile_mean(matrix.mean(axis=1))), float(low), float(high))

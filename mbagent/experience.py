@@ -1,0 +1,108 @@
+"""From the steps of a vector environment to transitions; no reset is ever taken for one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.base import Actions, States
+from mbagent.policies import as_batch
+from mbagent.spaces import FactoredSpace
+from mbagent.transitions import TransitionBatch, TransitionDataset
+
+_FLUSH = 256
+
+
+class ExperienceRecorder:
+    """Collects the steps of ``n_envs`` environments that reset themselves, as SB3's VecEnv do.
+
+    Args:
+        space: the observation space.
+        dataset: where transitions go.
+        n_envs: number of environments B.
+
+    Attributes:
+        states: int64 [B, F], the current state of every environment; None before ``reset``.
+    """
+
+    def __init__(self, space: FactoredSpace, dataset: TransitionDataset, n_envs: int) -> None:
+        """See the class."""
+        self._space, self._dataset = space, dataset
+        self._steps: list[TransitionBatch] = []
+        self._starts: list[States] = []
+        rows = dataset.rows().episodes
+        self._next_episode = int(rows.max()) + 1 if len(rows) else 0
+        self._episodes = np.zeros(n_envs, dtype=np.int64)
+        self.states: States | None = None
+
+    def reset(self, obs: Any) -> None:
+        """Every environment starts a new episode at ``obs`` (batched)."""
+        self.states = self._space.encode(obs)
+        self._begin(np.arange(len(self.states)))
+
+    def _begin(self, which: NDArray[np.int64]) -> None:
+        assert self.states is not None
+        self._episodes[which] = self._next_episode + np.arange(len(which))
+        self._next_episode += len(which)
+        self._starts.append(self.states[which])
+
+    def record(
+        self, actions: Actions, new_obs: Any, rewards: NDArray[Any], dones: NDArray[Any], infos: list[dict[str, Any]]
+    ) -> None:
+        """Adds one step of every environment.
+
+        Args:
+            actions: int64 [B], numbers of the enumerated actions.
+            new_obs: what the vector environment returned: where an episode ended, already the next one's first.
+            rewards: float [B].
+            dones: bool [B].
+            infos: SB3's: the true last observation is in ``terminal_observation``, a truncation in ``TimeLimit.truncated``.
+        """
+        assert self.states is not None
+        following = self._space.encode(new_obs)
+        next_states = following
+        ended = np.flatnonzero(dones)
+        terminated = np.array(dones, dtype=np.bool_)
+        if len(ended):
+            next_states = following.copy()
+            for i in ended:
+                last, _ = as_batch(self._space.space, infos[i]["terminal_observation"])
+                next_states[i] = self._space.encode(last)[0]
+                terminated[i] = not infos[i].get("TimeLimit.truncated", False)
+        self._steps.append(
+            TransitionBatch(
+                self.states,
+                actions.astype(np.int64),
+                next_states,
+                terminated,
+                np.asarray(rewards, dtype=np.float64),
+                self._episodes.copy(),
+            )
+        )
+        self.states = following
+        if len(ended):
+            self._begin(ended)
+        if len(self._steps) >= _FLUSH:
+            self.flush()
+
+    def flush(self) -> None:
+        """Hands what was collected to the dataset."""
+        if self._steps:
+            names = ("states", "actions", "next_states", "terminated", "rewards", "episodes")
+            self._dataset.append(TransitionBatch(*(np.concatenate([getattr(s, n) for s in self._steps]) for n in names)))
+            self._steps = []
+
+    def starts(self) -> States:
+        """Distinct start states met so far, int64 [S, F], in the order met."""
+        starts = np.concatenate(self._starts) if self._starts else np.zeros((0, len(self._space)), dtype=np.int64)
+        return distinct_rows(starts)
+
+
+def distinct_rows(rows: States) -> States:
+    """The distinct rows [S, F] of [N, F], in the order of their first appearance."""
+    if len(rows) == 0:
+        return rows
+    _, first = np.unique(rows, axis=0, return_index=True)
+    return rows[np.sort(first)]

@@ -1,0 +1,137 @@
+"""Which goal an agent plans for: the user's, the environment's own, or one learned from the rewards met."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Literal
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+
+from mbagent.planning.goal import Goal
+from mbagent.policies import PlannerPolicy
+from mbagent.rewards import GivenReward, RewardFn
+from mbagent.transitions import TransitionDataset
+
+Source = Literal["custom", "environment", "learned", "missing"]
+
+_PROBE_ROWS = 64
+
+
+class GoalBook:
+    """Keeps the candidates for the goal and decides between them.
+
+    With no custom reward the environment's own ``reward_fn`` is used if it has one and it reproduces every reward met
+    while exploring (wrappers can change spaces and rewards); else the learned reward, with a warning that says why.
+
+    Args:
+        policy: knows spaces and the learned reward.
+        transitions: what was met.
+
+    Attributes:
+        source: where the current goal comes from; "missing" after loading an agent whose custom reward was not given again.
+        learned: whether the reward model is fitted to all transitions.
+    """
+
+    def __init__(self, policy: PlannerPolicy, transitions: TransitionDataset) -> None:
+        """See the class."""
+        self._policy, self._transitions = policy, transitions
+        self._custom: GivenReward | None = None
+        self._environment: GivenReward | None = None
+        self._since = 0
+        self._has_environment = False
+        self.source: Source = "environment"
+        self.learned = False
+
+    def take_environment(self, env: VecEnv) -> None:
+        """Takes the ``reward_fn`` of a new environment, if it has one."""
+        self._since, self._has_environment = len(self._transitions), True
+        try:
+            fn = env.get_attr("reward_fn", indices=0)[0]
+        except Exception:  # a VecEnv in another process answers with whatever error pickling gives
+            fn = None
+        self._environment = self._given(fn) if callable(fn) else None
+
+    def forget_learned(self) -> None:
+        """The learned reward is out of date: there are new transitions."""
+        self.learned = False
+
+    def choose(self, reward: RewardFn | None) -> Goal | None:
+        """Changes the goal; ``None`` goes back to the environment's own.
+
+        Raises:
+            TypeError, ValueError: the function is no reward function; nothing is changed then.
+        """
+        custom = None
+        if reward is not None:
+            custom = self._given(reward)
+            self._probe(custom)
+        self._custom = custom
+        self.source = "custom" if custom is not None else "environment"
+        return self.current()
+
+    def current(self) -> Goal | None:
+        """The goal to plan for; None while nothing is learned and no reward is given."""
+        if self.source == "missing":
+            return None
+        if self._custom is not None:
+            return self._custom
+        problem = self._environment_problem()
+        if problem is None:
+            self.source = "environment"
+            return self._environment
+        self.source = "learned"
+        if not self._policy.fitted:
+            return None
+        warnings.warn(f"{problem}, so the agent plans with a reward learned from the rewards it met.", stacklevel=5)
+        return self.learned_goal()
+
+    def restore(self, source: Source) -> Goal | None:
+        """The goal of an agent loaded from a file, where only its source is kept; None if it must be given again."""
+        if source == "custom":
+            self.source = "missing"
+            return None
+        self.source = source
+        return self.learned_goal() if source == "learned" else self.current()
+
+    def learned_goal(self) -> Goal:
+        """The reward model, fitted first if need be."""
+        self.fit_learned()
+        return self._policy.reward_model
+
+    def fit_learned(self) -> None:
+        """Fits the reward model to the rewards met, unless that is done."""
+        rows = self._transitions.rows()
+        if not self.learned and len(rows):
+            recent = np.arange(self._since if self._since < len(rows) else 0, len(rows))
+            self._policy.reward_model.fit(rows.select(recent))
+            self.learned = True
+
+    def _environment_problem(self) -> str | None:
+        """Why the environment's own reward function cannot be used, or None."""
+        if self._environment is None:
+            return "The environment has no reward_fn" if self._has_environment else "There is no environment"
+        rows = self._transitions.rows().select(np.arange(self._since, len(self._transitions)))
+        try:
+            rewards = self._environment(rows.states, rows.actions, rows.next_states)
+        except Exception as error:
+            return f"The environment's reward_fn does not take its observations ({type(error).__name__}: {error})"
+        wrong = ~np.isclose(rewards, rows.rewards, rtol=1e-4, atol=1e-6)
+        if wrong.any():
+            return f"The environment's reward_fn differs from {int(wrong.sum())} of the {len(rows)} rewards met"
+        return None
+
+    def _probe(self, reward: GivenReward) -> None:
+        """Tries a reward function on transitions met, or on the space's first observation."""
+        rows = self._transitions.rows()
+        if len(rows):
+            picked = rows.select(np.linspace(0, len(rows) - 1, min(_PROBE_ROWS, len(rows))).astype(np.int64))
+            reward(picked.states, picked.actions, picked.next_states)
+            return
+        states = np.zeros((3, len(self._policy.factored)), dtype=np.int64)
+        if len(self._policy.start_states):
+            states = self._policy.start_states[np.arange(3) % len(self._policy.start_states)]
+        reward(states, np.zeros(3, dtype=np.int64), states)
+
+    def _given(self, fn: RewardFn) -> GivenReward:
+        return GivenReward(fn, self._policy.factored, self._policy.actions)

@@ -1,0 +1,22 @@
+"""Transition models: the paper's predictor and conditioner, tables, and the true simulator behind one protocol."""
+
+from mbagent.models.base import BaseTransitionModel, FitReport, Successors, TransitionModel
+from mbagent.models.networks import Conditioner, DensePredictor, FactorCodec, Predictor
+from mbagent.models.neural import NeuralConfig, NeuralTransitionModel
+from mbagent.models.simulator import SimulatorModel
+from mbagent.models.training import TrainingConfig
+
+__all__ = [
+    "BaseTransitionModel",
+    "Conditioner",
+    "DensePredictor",
+    "FactorCodec",
+    "FitReport",
+    "NeuralConfig",
+    "NeuralTransitionModel",
+    "Predictor",
+    "SimulatorModel",
+    "Successors",
+    "TrainingConfig",
+    "TransitionModel",
+]

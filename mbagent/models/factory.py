@@ -1,0 +1,66 @@
+"""From the name of a model to the model: what the space's structure calls for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from mbagent.models.base import TransitionModel
+from mbagent.models.neural import NeuralConfig, NeuralTransitionModel
+from mbagent.models.planes import PlanePredictor
+from mbagent.models.training import TrainingConfig
+from mbagent.spaces import FactoredSpace
+
+ModelFactory = Callable[[FactoredSpace, int, float], TransitionModel]
+"""``factory(space, n_actions, learning_rate) -> model``."""
+
+PLANE_TRAINING = TrainingConfig(batch_size=128, min_steps=1500, max_steps=2500)
+"""Shared weights see every position in every row, so they need fewer steps than dense ones."""
+
+
+def build_auto(space: FactoredSpace, n_actions: int, learning_rate: float) -> TransitionModel:
+    """Weights shared over positions where the observation is a stack of planes, else predictor and causal conditioner."""
+    planes = space.planes
+    if planes is None:
+        training = replace(TrainingConfig(), learning_rate=learning_rate)
+        return NeuralTransitionModel(space.cardinalities, n_actions, NeuralConfig(training=training))
+    config = NeuralConfig(conditioner=None, training=replace(PLANE_TRAINING, learning_rate=learning_rate))
+    return NeuralTransitionModel(
+        space.cardinalities,
+        n_actions,
+        config,
+        body=lambda codec, generator: PlanePredictor(codec, planes, generator=generator),
+    )
+
+
+def build_paper(space: FactoredSpace, n_actions: int, learning_rate: float) -> TransitionModel:
+    """Section 3's two networks as they stand, on flat variables."""
+    config = NeuralConfig.paper(len(space))
+    return NeuralTransitionModel(
+        space.cardinalities, n_actions, replace(config, training=replace(config.training, learning_rate=learning_rate))
+    )
+
+
+_FACTORIES: dict[str, ModelFactory] = {"auto": build_auto, "paper": build_paper}
+
+
+def register_model(name: str, factory: ModelFactory) -> None:
+    """Makes ``model=name`` build a model of your own, so that agents with it can be saved and loaded.
+
+    Raises:
+        ValueError: the name is taken.
+    """
+    if name in _FACTORIES and _FACTORIES[name] is not factory:
+        raise ValueError(f"A model called {name!r} is registered already; choose another name.")
+    _FACTORIES[name] = factory
+
+
+def build_model(name: str, space: FactoredSpace, n_actions: int, learning_rate: float) -> TransitionModel:
+    """The model registered as ``name``.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if name not in _FACTORIES:
+        raise ValueError(f"There is no model called {name!r}; choose one of {sorted(_FACTORIES)} or pass a TransitionModel.")
+    return _FACTORIES[name](space, n_actions, learning_rate)

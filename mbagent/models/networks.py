@@ -1,0 +1,256 @@
+"""The two networks of the paper's section 3: the predictor (3.1) and the conditioner with grouped hidden nodes (3.2).
+
+The paper's variables are bits; here a variable is a *factor* with any number of values (a bit is a factor with two), and
+termination is one more output factor, the last. Shapes: B batch, F state factors, O = F + 1 output factors, K largest
+cardinality, G hidden nodes in a group.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Literal, Protocol, TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+Mask: TypeAlias = Literal["causal", "others"]
+"""What output i of a conditioner sees of the next state: y_<i ("causal") or every y but y_i ("others", the paper's)."""
+
+Activation: TypeAlias = Literal["sigmoid", "relu", "silu", "tanh"]
+
+ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "sigmoid": torch.sigmoid,
+    "relu": torch.relu,
+    "silu": functional.silu,
+    "tanh": torch.tanh,
+}
+
+IMPOSSIBLE = -1e9
+"""The logit of a value that a factor does not have."""
+
+RESIDUAL_START = 2.0
+"""Where the logit of "this factor stays as it is" starts: most variables of most worlds mostly do."""
+
+
+class FactorCodec(nn.Module):
+    """Translates factors into network inputs, and columns of network outputs into logits.
+
+    A factor with two values is one 0/1 column, as in the paper; one with k > 2 values is k columns, one of them 1.
+
+    Args:
+        cardinalities: number of values of each state factor, length F.
+        n_actions: number of enumerated actions A.
+
+    Attributes:
+        outputs: cardinalities of the O = F + 1 output factors; the last is ``terminated``.
+        width: K, the largest of ``outputs``.
+        n_inputs: columns of (state, action).
+        n_columns: columns of the output factors.
+    """
+
+    def __init__(self, cardinalities: Sequence[int], n_actions: int) -> None:
+        super().__init__()
+        self.cardinalities = tuple(int(c) for c in cardinalities)
+        self.outputs = (*self.cardinalities, 2)
+        self.n_actions = int(n_actions)
+        self.width = max(self.outputs)
+        factor, value = _columns(self.outputs)
+        self.n_columns = len(factor)
+        self.n_state_columns = int((factor < len(self.cardinalities)).sum())
+        self.n_inputs = self.n_state_columns + self.n_actions
+        self.all_binary = all(c == 2 for c in self.outputs)
+        self.column_factor: Tensor
+        self.column_value: Tensor
+        self.slots: Tensor
+        self.floor: Tensor
+        self._constant("column_factor", torch.from_numpy(factor))
+        self._constant("column_value", torch.from_numpy(value))
+        self._constant("slots", torch.from_numpy(factor * self.width + value))
+        possible = np.arange(self.width) < np.asarray(self.outputs)[:, None]
+        self._constant("floor", torch.from_numpy(np.where(possible, 0.0, IMPOSSIBLE).astype(np.float32)))
+
+    def _constant(self, name: str, value: Tensor) -> None:
+        self.register_buffer(name, value, persistent=False)
+
+    def inputs(self, states: Tensor, actions: Tensor) -> Tensor:
+        """Columns of a state and an action, float [B, n_inputs], from int64 [B, F] and int64 [B]."""
+        n = self.n_state_columns
+        state = self._one_hot(states, self.column_factor[:n], self.column_value[:n])
+        return torch.cat((state, functional.one_hot(actions, self.n_actions).to(state.dtype)), dim=1)
+
+    def targets(self, factors: Tensor) -> Tensor:
+        """Columns of output factors, float [B, n_columns], from int64 [B, O]."""
+        return self._one_hot(factors, self.column_factor, self.column_value)
+
+    def _one_hot(self, factors: Tensor, factor: Tensor, value: Tensor) -> Tensor:
+        if self.all_binary:
+            return factors[:, : len(factor)].to(torch.float32)
+        return (factors[:, factor] == value).to(torch.float32)
+
+    def logits(self, columns: Tensor) -> Tensor:
+        """Logits [B, O, K] from output columns [B, n_columns]; value 0 of a binary factor has the logit 0."""
+        if self.all_binary:
+            return torch.stack((torch.zeros_like(columns), columns), dim=2)
+        flat = columns.new_zeros(len(columns), len(self.outputs) * self.width)
+        flat = flat.index_copy(1, self.slots, columns)
+        return flat.view(-1, len(self.outputs), self.width) + self.floor
+
+
+class Predictor(Protocol):
+    """What every predictor body is: an ``nn.Module`` that gives each output factor's logits from a state and an action."""
+
+    def __call__(self, states: Tensor, actions: Tensor) -> Tensor:
+        """Logits [B, O, K] from states int64 [B, F] and actions int64 [B]; values a factor lacks are at ``IMPOSSIBLE``."""
+        ...
+
+
+class Affine(nn.Module):
+    """``nn.Linear`` that takes its first weights from a generator of its own, never from the process-wide one.
+
+    Args:
+        n_in: inputs.
+        n_out: outputs.
+        generator: source of the weights.
+        mask: bool [n_out, n_in], False where a weight is pruned: it is zero and gets no gradient. None: all there.
+        fan_in: connections of one output, for the size of the first weights (default: n_in).
+    """
+
+    def __init__(
+        self, n_in: int, n_out: int, generator: torch.Generator, mask: Tensor | None = None, fan_in: int | None = None
+    ) -> None:
+        super().__init__()
+        bound = 1.0 / math.sqrt(max(1, fan_in or n_in))
+        self.weight = nn.Parameter(uniform((n_out, n_in), bound, generator))
+        self.bias = nn.Parameter(uniform((n_out,), bound, generator))
+        self.mask: Tensor | None
+        self.register_buffer("mask", mask)
+        if mask is not None:
+            self.weight.data *= mask
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Outputs [B, n_out] from inputs [B, n_in]."""
+        weight = self.weight if self.mask is None else self.weight * self.mask
+        return functional.linear(values, weight, self.bias)
+
+
+class DensePredictor(nn.Module):
+    """The predictor network (paper 3.1): state and action in, each next factor's logits out, all connected to all.
+
+    Args:
+        codec: the factors.
+        hidden: sizes of the hidden layers (the paper: one of 2d + 1).
+        activation: of the hidden nodes (the paper: sigmoid).
+        residual: adds a learned path from each s_i to s'_i, one weight for each (action, factor).
+        generator: source of the first weights.
+    """
+
+    def __init__(
+        self,
+        codec: FactorCodec,
+        hidden: Sequence[int] = (128,),
+        activation: Activation = "silu",
+        residual: bool = True,
+        *,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        self.codec = codec
+        self.activation = activation
+        sizes = (codec.n_inputs, *hidden)
+        self.layers = nn.ModuleList(Affine(a, b, generator) for a, b in zip(sizes, sizes[1:], strict=False))
+        self.out = Affine(sizes[-1], codec.n_columns, generator)
+        if residual:
+            self.out.weight.data *= 0.1  # start near "nothing changes"
+        self.stay: nn.Parameter | None = None
+        if residual:
+            self.stay = nn.Parameter(torch.full((codec.n_actions, codec.n_state_columns), RESIDUAL_START))
+
+    def forward(self, states: Tensor, actions: Tensor) -> Tensor:
+        """See Predictor."""
+        inputs = values = self.codec.inputs(states, actions)
+        for layer in self.layers:
+            values = ACTIVATIONS[self.activation](layer(values))
+        columns = self.out(values)
+        if self.stay is not None:
+            n = self.codec.n_state_columns
+            signed = 2.0 * inputs[:, :n] - 1.0
+            columns = torch.cat((columns[:, :n] + self.stay[actions] * signed, columns[:, n:]), dim=1)
+        return self.codec.logits(columns)
+
+
+class Conditioner(nn.Module):
+    """The conditioner network (paper 3.2): output i is the distribution of y_i given (s, a) and other next factors.
+
+    One hidden layer in O groups. Group i sees (s, a) and, of the next factors, y_<i (mask "causal") or all but y_i (mask
+    "others"); output i reads group i and nothing else, so nothing of y_i reaches output i.
+
+    Args:
+        codec: the factors.
+        mask: what a group sees.
+        group_size: hidden nodes G in a group (the paper: 2d, of 2d^2 + 1 in all).
+        activation: of the hidden nodes.
+        correction: outputs start at zero, since they are added to the predictor's logits; False: they stand alone (the paper).
+        generator: source of the first weights.
+    """
+
+    def __init__(
+        self,
+        codec: FactorCodec,
+        mask: Mask = "causal",
+        group_size: int = 16,
+        activation: Activation = "silu",
+        correction: bool = True,
+        *,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        self.codec = codec
+        self.mask_kind: Mask = mask
+        self.group_size = group_size
+        self.activation = activation
+        self.correction = correction
+        visible = group_mask(codec, mask, group_size)
+        fan_in = codec.n_inputs + codec.n_columns // 2
+        self.groups = Affine(codec.n_inputs + codec.n_columns, len(visible), generator, visible, fan_in)
+        n_values = 1 if codec.all_binary else codec.width
+        bound = 0.0 if correction else 1.0 / math.sqrt(group_size)
+        shape = (len(codec.outputs), group_size, n_values)
+        self.readout = nn.Parameter(uniform(shape, bound, generator))
+        self.offset = nn.Parameter(uniform((len(codec.outputs), 1, n_values), bound, generator))
+
+    def forward(self, states: Tensor, actions: Tensor, next_factors: Tensor) -> Tensor:
+        """Logits [B, O, K] from states int64 [B, F], actions int64 [B], next_factors int64 [B, O] (see ``from_columns``)."""
+        return self.from_columns(self.codec.inputs(states, actions), self.codec.targets(next_factors))
+
+    def from_columns(self, inputs: Tensor, targets: Tensor) -> Tensor:
+        """Logits [B, O, K] from columns of (s, a) [B, n_inputs] and of the next factors [B, n_columns], bits or guesses."""
+        n_outputs = len(self.codec.outputs)
+        hidden = ACTIVATIONS[self.activation](self.groups(torch.cat((inputs, targets), dim=1)))
+        grouped = hidden.view(-1, n_outputs, self.group_size).transpose(0, 1)
+        values = (torch.bmm(grouped, self.readout) + self.offset).transpose(0, 1)
+        if self.codec.all_binary:
+            return self.codec.logits(values[:, :, 0])
+        return values + self.codec.floor
+
+
+def group_mask(codec: FactorCodec, mask: Mask, group_size: int) -> Tensor:
+    """Which inputs each hidden node of a conditioner sees: bool [O * group_size, n_inputs + n_columns]."""
+    outputs = torch.arange(len(codec.outputs))[:, None]
+    seen = codec.column_factor < outputs if mask == "causal" else codec.column_factor != outputs
+    everything = torch.ones(len(outputs), codec.n_inputs, dtype=torch.bool)
+    return torch.cat((everything, seen), dim=1).repeat_interleave(group_size, dim=0)
+
+
+def uniform(shape: Sequence[int], bound: float, generator: torch.Generator) -> Tensor:
+    """Numbers uniform in [-bound, bound), drawn from ``generator``."""
+    return (torch.rand(tuple(shape), generator=generator) * 2.0 - 1.0) * bound
+
+
+def _columns(cardinalities: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+    """The factor and the value that each column stands for, int64 [n_columns] each."""
+    pairs = [(f, v) for f, c in enumerate(cardinalities) for v in (range(c) if c != 2 else (1,))]
+    factor, value = np.asarray(pairs, dtype=np.int64).reshape(-1, 2).T
+    return np.ascontiguousarray(factor), np.ascontiguousarray(value)

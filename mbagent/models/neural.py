@@ -1,0 +1,328 @@
+"""The learned model of the paper's section 3: a predictor network, and a conditioner network on top of it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from mbagent.models.base import (
+    Actions,
+    BaseTransitionModel,
+    Bools,
+    FitReport,
+    Floats,
+    Randomness,
+    States,
+    Successors,
+    as_keys,
+)
+from mbagent.models.kernels import DenseWeights, Floats32, GroupWeights, dense_logits, probabilities
+from mbagent.models.networks import Activation, Conditioner, DensePredictor, FactorCodec, Mask
+from mbagent.models.packing import pack_dense, pack_groups, pack_layout
+from mbagent.models.samplers import log_prob_causal, sample_causal, sample_independent, sample_sweeps
+from mbagent.models.systematic import causal_successors, independent_successors
+from mbagent.models.training import Trainer, TrainingConfig, as_examples, examples
+from mbagent.transitions import TransitionDataset
+
+BodyFactory: TypeAlias = Callable[[FactorCodec, torch.Generator], nn.Module]
+"""Builds a predictor body (see ``networks.Predictor``); all its first weights must come from the generator."""
+
+CHUNK = 64
+"""Rows that a torch body is evaluated on at once, always this many: matrix products round differently in other sizes."""
+
+
+@dataclass(frozen=True)
+class NeuralConfig:
+    """What the networks look like and how they are used.
+
+    Attributes:
+        hidden: sizes of the dense predictor's hidden layers.
+        activation: of all hidden nodes.
+        residual: whether the predictor has a learned path from s_i to s'_i.
+        conditioner: "causal" (ancestral sampling, exact probabilities), "others" (the paper's sweeps), or None (factors
+            independent given state and action).
+        group_size: hidden nodes in each of the conditioner's groups.
+        correction: whether the conditioner's output is added to the predictor's logits.
+        certain: a factor whose likeliest value has this probability in the predictor's eyes is left to the predictor.
+        sweeps: passes over all factors, mask "others".
+        real_guess: whether the first guess is the predictor's probabilities rather than bits drawn from them.
+        training: see TrainingConfig.
+    """
+
+    hidden: tuple[int, ...] = (128,)
+    activation: Activation = "silu"
+    residual: bool = True
+    conditioner: Mask | None = "causal"
+    group_size: int = 16
+    correction: bool = True
+    certain: float = 0.999
+    sweeps: int = 5
+    real_guess: bool = False
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+
+    @classmethod
+    def paper(cls, n_variables: int) -> NeuralConfig:
+        """Section 3's networks as they stand, for d = ``n_variables``: 2d + 1 and 2d^2 hidden nodes, sigmoids, squared error."""
+        return cls(
+            hidden=(2 * n_variables + 1,),
+            activation="sigmoid",
+            residual=False,
+            conditioner="others",
+            group_size=2 * n_variables,
+            correction=False,
+            certain=1.0,
+            training=TrainingConfig(learning_rate=0.03, weight_decay=0.0, loss="squared"),
+        )
+
+
+class NeuralTransitionModel(BaseTransitionModel):
+    """A predictor network, alone or with a conditioner network.
+
+    Args:
+        cardinalities: number of values of each state factor, length F.
+        n_actions: number of enumerated actions A.
+        config: see NeuralConfig.
+        body: builds another predictor body than the dense one.
+        seed: of the first weights; ``fit`` starts from its own seed's.
+    """
+
+    def __init__(
+        self,
+        cardinalities: tuple[int, ...],
+        n_actions: int,
+        config: NeuralConfig | None = None,
+        *,
+        body: BodyFactory | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(cardinalities, n_actions)
+        self.config = config or NeuralConfig()
+        self.codec = FactorCodec(self.cardinalities, self.n_actions)
+        self._body = body
+        self._layout = pack_layout(self.codec)
+        self._build(seed)
+
+    def _build(self, seed: int) -> None:
+        config, generator = self.config, torch.Generator().manual_seed(seed)
+        self.predictor: nn.Module
+        if self._body is not None:
+            self.predictor = self._body(self.codec, generator)
+        else:
+            self.predictor = DensePredictor(
+                self.codec, config.hidden, config.activation, config.residual, generator=generator
+            )
+        self.conditioner: Conditioner | None = None
+        if config.conditioner is not None:
+            self.conditioner = Conditioner(
+                self.codec,
+                config.conditioner,
+                config.group_size,
+                config.activation,
+                config.correction,
+                generator=generator,
+            )
+        self._online: torch.optim.Optimizer | None = None
+        self._changed()
+
+    def _changed(self) -> None:
+        self._dense: DenseWeights | None = None
+        self._groups: GroupWeights | None = None
+
+    def fit(
+        self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None
+    ) -> FitReport:
+        """See TransitionModel; fits anew from first weights that depend on ``seed`` only."""
+        began = time.perf_counter()
+        self._build(seed)
+        train_rows, held_out_rows = data.split(self.config.training.validation, seed)
+        held_out = examples(held_out_rows)
+        trainer = Trainer(self.codec, self.predictor, self.conditioner, self.config.training)
+        generator = torch.Generator().manual_seed(seed + 1)
+        train = examples(train_rows)
+        epochs = trainer.fit(train, held_out, generator, progress)
+        self._changed()
+        first, second = trainer.evaluate(held_out)
+        return FitReport(
+            n_train=len(train_rows),
+            n_validation=len(held_out_rows),
+            epochs=round(epochs),
+            seconds=time.perf_counter() - began,
+            predictor_loss=first,
+            conditioner_loss=second,
+            exact_match=self._exact_match(held_out),
+            log={"distinct_transitions": float(len(train))},
+        )
+
+    def _exact_match(self, rows: Any) -> float:
+        """Weighted share of transitions whose likeliest outcome, factor after factor, is the one met."""
+        states, actions, outcomes = rows.states.numpy(), rows.actions.numpy(), rows.outcomes.numpy()
+        logits, probs = self._predict(states, actions)
+        likeliest = probs.argmax(axis=2)
+        if self.config.conditioner == "causal":
+            keys = np.zeros(len(states), dtype=np.uint64)
+            likeliest = sample_causal(
+                states, actions, logits, probs, keys, self._layout, self._packed_groups(), self.config.certain, True
+            )
+        weights = rows.weights.numpy()
+        return float(np.average((likeliest == outcomes).all(axis=1), weights=weights)) if len(weights) else 1.0
+
+    def observe(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> None:
+        """The paper's on-line method: one gradient step with each observation's own outcome as target.
+
+        Follows a world whose dynamics change; slower, and it depends on the order of what is seen.
+        """
+        trainer = Trainer(self.codec, self.predictor, self.conditioner, self.config.training)
+        if self._online is None:
+            parameters = [p for module in trainer.modules for p in module.parameters()]
+            self._online = torch.optim.Adam(parameters, lr=self.config.training.online_learning_rate)
+        trainer.step(self._online, as_examples(states, actions, next_states, terminated))
+        self._changed()
+
+    def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
+        """See TransitionModel."""
+        keys = as_keys(rng, len(states))
+        states, actions = _rows(states, actions)
+        logits, probs = self._predict(states, actions)
+        config = self.config
+        if config.conditioner is None:
+            factors = sample_independent(probs, self._layout.outputs, keys)
+        elif config.conditioner == "causal":
+            factors = sample_causal(
+                states, actions, logits, probs, keys, self._layout, self._packed_groups(), config.certain, False
+            )
+        else:
+            factors = sample_sweeps(
+                states,
+                actions,
+                logits,
+                probs,
+                keys,
+                self._layout,
+                self._packed_groups(),
+                config.certain,
+                config.sweeps,
+                config.real_guess,
+            )
+        return np.ascontiguousarray(factors[:, :-1]), factors[:, -1] == 1
+
+    def marginals(self, states: States, actions: Actions) -> Floats:
+        """See TransitionModel."""
+        probs = self.probabilities(states, actions)[:, :-1]
+        possible = np.arange(self.codec.width) < np.asarray(self.cardinalities)[:, None]
+        return probs[:, possible]
+
+    def probabilities(self, states: States, actions: Actions) -> Floats:
+        """The predictor's output for every factor and ``terminated``, the last: float64 [B, O, K], 0 where a factor lacks a value."""
+        return self._predict(*_rows(states, actions))[1]
+
+    def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
+        """See TransitionModel; exact for the distribution that ``sample`` draws from."""
+        if self.config.conditioner == "others":
+            raise NotImplementedError(
+                'A conditioner with mask "others" samples by sweeps and has no exact probabilities; '
+                'use NeuralConfig(conditioner="causal").'
+            )
+        states, actions = _rows(states, actions)
+        outcomes = np.concatenate([next_states, terminated[:, None]], axis=1).astype(np.int64)
+        logits, probs = self._predict(states, actions)
+        if self.config.conditioner is None:
+            with np.errstate(divide="ignore"):
+                return np.log(np.take_along_axis(probs, outcomes[:, :, None], axis=2)[:, :, 0]).sum(axis=1)
+        return log_prob_causal(
+            states, actions, outcomes, logits, probs, self._layout, self._packed_groups(), self.config.certain
+        )
+
+    def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
+        """See TransitionModel; systematic draws where probabilities are exact (``systematic.py``), else plain draws."""
+        if self.config.conditioner == "others":
+            return super().successors(states, actions, n_samples, seed)
+        states, actions = _rows(states, actions)
+        logits, probs = self._predict(states, actions)
+        if self.config.conditioner is None:
+            return independent_successors(probs, self._layout.outputs, n_samples, seed)
+        return causal_successors(
+            states,
+            actions,
+            logits,
+            probs,
+            self._layout,
+            self._packed_groups(),
+            self.config.certain,
+            n_samples,
+            seed,
+        )
+
+    def state_dict(self) -> dict[str, NDArray[Any]]:
+        """See TransitionModel."""
+        return {
+            f"{part}.{name}": tensor.detach().numpy().copy()
+            for part, module in self._parts().items()
+            for name, tensor in module.state_dict().items()
+        }
+
+    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """See TransitionModel.
+
+        Raises:
+            ValueError: the arrays are not those of a model of this shape; nothing is changed then.
+        """
+        own = self.state_dict()
+        wrong = sorted(set(own) ^ set(state)) or sorted(n for n in own if own[n].shape != np.shape(state[n]))
+        if wrong:
+            raise ValueError(
+                f"These weights do not fit this model (first difference: {wrong[0]!r}); "
+                "build the model with the configuration that the weights were saved from."
+            )
+        for part, module in self._parts().items():
+            names = module.state_dict()
+            module.load_state_dict({n: torch.from_numpy(np.array(state[f"{part}.{n}"])) for n in names})
+        self._online = None
+        self._changed()
+
+    def _parts(self) -> dict[str, nn.Module]:
+        parts = {"predictor": self.predictor}
+        if self.conditioner is not None:
+            parts["conditioner"] = self.conditioner
+        return parts
+
+    def _packed_groups(self) -> GroupWeights:
+        if self._groups is None:
+            assert self.conditioner is not None
+            self._groups = pack_groups(self.conditioner)
+        return self._groups
+
+    def _predict(self, states: States, actions: Actions) -> tuple[Floats32, Floats]:
+        """The predictor's logits float32 and probabilities float64, [B, O, K]."""
+        if isinstance(self.predictor, DensePredictor):
+            if self._dense is None:
+                self._dense = pack_dense(self.predictor)
+            logits = dense_logits(states, actions, self._layout, self._dense)
+        else:
+            logits = in_chunks(self.predictor, states, actions)
+        return logits, probabilities(logits, self._layout.outputs)
+
+
+@torch.inference_mode()
+def in_chunks(predictor: nn.Module, states: States, actions: Actions) -> Floats32:
+    """Logits float32 [B, O, K] of a torch body, evaluated ``CHUNK`` rows at a time, the last rows filled up with zeros."""
+    parts = []
+    for start in range(0, max(len(states), 1), CHUNK):
+        rows = slice(start, min(start + CHUNK, len(states)))
+        n = rows.stop - rows.start
+        chunk_states = np.zeros((CHUNK, states.shape[1]), dtype=np.int64)
+        chunk_actions = np.zeros(CHUNK, dtype=np.int64)
+        chunk_states[:n], chunk_actions[:n] = states[rows], actions[rows]
+        parts.append(predictor(torch.from_numpy(chunk_states), torch.from_numpy(chunk_actions)).numpy()[:n])
+    return np.concatenate(parts).astype(np.float32, copy=False)
+
+
+def _rows(states: States, actions: Actions) -> tuple[States, Actions]:
+    """Both as contiguous int64, the one form that the compiled kernels take."""
+    return np.ascontiguousarray(states, dtype=np.int64), np.ascontiguousarray(actions, dtype=np.int64)

@@ -1,0 +1,80 @@
+"""The finite-state machine of all states a model can reach (paper section 2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.base import Bools, Floats, States, TransitionModel
+from mbagent.models.state_graph import StateGraph
+
+
+@dataclass(frozen=True)
+class ReachableMDP:
+    """States, and for each (state, action) the successors with probability and terminated. Rewards stay with the planner.
+
+    Attributes:
+        states: int64 [N, F], the start states first.
+        offsets: int64 [N, A + 1]; successors of state i under action a are ``offsets[i, a] : offsets[i, a + 1]``.
+        next_states: int64 [M], indices of states.
+        probabilities: float64 [M].
+        terminated: bool [M].
+        complete: whether every reachable state was expanded within the budget.
+    """
+
+    states: States
+    offsets: NDArray[np.int64]
+    next_states: NDArray[np.int64]
+    probabilities: Floats
+    terminated: Bools
+    complete: bool
+
+
+def grow_reachable(
+    model: TransitionModel, start: States, max_states: int, n_samples: int, seed: int = 0
+) -> tuple[StateGraph, bool]:
+    """Expands states breadth-first from ``start`` until none is left or ``max_states`` are expanded.
+
+    Args:
+        model: the model to imagine with.
+        start: int64 [B, F].
+        max_states: number of states expanded at most.
+        n_samples: draws for a (state, action) with too many successors to enumerate.
+        seed: which random numbers those draws use.
+
+    Returns:
+        (graph with one group 0, whether every reachable state was expanded).
+    """
+    graph = StateGraph(model)
+    layer = np.unique(graph.add(start, np.zeros(len(start), dtype=np.int64)))
+    expanded = 0
+    while len(layer):
+        layer = layer[: max_states - expanded]
+        if len(layer) == 0:
+            return graph, False
+        expanded += len(layer)
+        graph.expand(layer, n_samples, seed)
+        waiting = np.flatnonzero(~graph.expanded)
+        layer = waiting[~graph.only_terminal(waiting)]
+    return graph, True
+
+
+def reachable_mdp(
+    model: TransitionModel, start: States, max_states: int = 10_000, n_samples: int = 32, seed: int = 0
+) -> ReachableMDP:
+    """The machine reachable from ``start`` int64 [B, F], as plain arrays; see ``grow_reachable`` for the arguments."""
+    graph, complete = grow_reachable(model, start, max_states, n_samples, seed)
+    order = np.lexsort((graph.actions, graph.sources))
+    counts = graph.count
+    ends = np.cumsum(counts.ravel()).reshape(counts.shape)
+    starts = ends[:, :1] - counts[:, :1]
+    return ReachableMDP(
+        states=graph.states.copy(),
+        offsets=np.concatenate([starts, ends], axis=1),
+        next_states=graph.next_nodes[order],
+        probabilities=graph.probabilities[order],
+        terminated=graph.terminated[order],
+        complete=complete,
+    )

@@ -1,0 +1,129 @@
+"""The true model: a game's own rules behind the models' protocol, to compare learned models and planners with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from mbagent_envs import Game
+from numpy.typing import NDArray
+
+from mbagent.models.base import (
+    Actions,
+    BaseTransitionModel,
+    Bools,
+    FitReport,
+    Floats,
+    Randomness,
+    States,
+    Successors,
+    as_keys,
+)
+from mbagent.models.systematic import thin
+from mbagent.spaces import FactoredSpace
+from mbagent.transitions import TransitionDataset
+
+
+class SimulatorModel(BaseTransitionModel):
+    """A game's true dynamics. There is nothing to learn: ``fit`` does nothing and ``state_dict`` is empty.
+
+    Args:
+        game: the game; its observation is the whole state.
+    """
+
+    def __init__(self, game: Game) -> None:
+        self.game = game
+        self.space = FactoredSpace(game.observation_space)
+        super().__init__(self.space.cardinalities, int(game.action_space.n))
+        self._shape = game.observation_space.shape
+
+    def fit(
+        self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None
+    ) -> FitReport:
+        """Does nothing: the rules are known."""
+        if progress is not None:
+            progress(1.0)
+        return FitReport(n_train=len(data), n_validation=0, epochs=0, seconds=0.0)
+
+    def _observations(self, states: States) -> NDArray[np.int8]:
+        return np.ascontiguousarray(states, dtype=np.int8).reshape(len(states), *self._shape)
+
+    def _factors(self, observations: NDArray[np.int8]) -> States:
+        return observations.reshape(len(observations), -1).astype(np.int64)
+
+    def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
+        """See TransitionModel."""
+        observations = self._observations(states)
+        following = self.game.transition(observations, actions, as_keys(rng, len(states)))
+        return self._factors(following), self.game.terminated(observations, actions, following)
+
+    def marginals(self, states: States, actions: Actions) -> Floats:
+        """See TransitionModel; exact where the game lists its successors.
+
+        Raises:
+            NotImplementedError: the game cannot list them.
+        """
+        found = self._listed(states, actions)
+        totals = np.zeros((len(states), len(self.cardinalities)))
+        np.add.at(totals, found.rows, found.states * found.probabilities[:, None])
+        return np.stack((1.0 - totals, totals), axis=2).reshape(len(states), -1)
+
+    def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
+        """See TransitionModel.
+
+        Raises:
+            NotImplementedError: the game cannot list its successors.
+        """
+        found = self._listed(states, actions)
+        rows = found.rows
+        met = (found.states == next_states[rows]).all(axis=1) & (found.terminated == terminated[rows])
+        mass = np.bincount(rows[met], weights=found.probabilities[met], minlength=len(states))
+        with np.errstate(divide="ignore"):
+            return np.log(mass)
+
+    def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
+        """See TransitionModel; rows whose successors the game cannot list are drawn, with numbers shared by all rows."""
+        lists = [self._list(state, action) for state, action in zip(self._observations(states), actions, strict=True)]
+        missing = np.flatnonzero([found is None for found in lists])
+        if len(missing):
+            drawn = super().successors(states[missing], actions[missing], n_samples, seed)
+            for k, row in enumerate(missing):
+                part = slice(drawn.offsets[k], drawn.offsets[k + 1])
+                lists[row] = (self._observations(drawn.states[part]), drawn.probabilities[part])
+        return thin(self._joined(states, actions, lists), n_samples, seed)
+
+    def _listed(self, states: States, actions: Actions) -> Successors:
+        observations = self._observations(states)
+        pairs = zip(observations, actions, strict=True)
+        return self._joined(states, actions, [self.game.transition_distribution(o, int(a)) for o, a in pairs])
+
+    def _list(self, observation: NDArray[np.int8], action: int) -> tuple[NDArray[np.int8], Floats] | None:
+        try:
+            return self.game.transition_distribution(observation, int(action))
+        except NotImplementedError:
+            return None
+
+    def _joined(self, states: States, actions: Actions, lists: list[Any]) -> Successors:
+        counts = np.asarray([len(probabilities) for _, probabilities in lists], dtype=np.int64)
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        if not lists:
+            return Successors(offsets, states.copy(), np.zeros(0, dtype=np.bool_), np.zeros(0))
+        following = np.concatenate([observations for observations, _ in lists])
+        before, taken = np.repeat(self._observations(states), counts, axis=0), np.repeat(actions, counts)
+        terminated = self.game.terminated(before, taken, following)
+        weights = np.concatenate([probabilities for _, probabilities in lists])
+        return Successors(offsets, self._factors(following), terminated, weights)
+
+    def state_dict(self) -> dict[str, NDArray[Any]]:
+        """Empty."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Takes the empty mapping.
+
+        Raises:
+            ValueError: there are weights in it.
+        """
+        if state:
+            raise ValueError(f"The true simulator has no weights, but was given {sorted(state)[0]!r} and perhaps more.")

@@ -1,0 +1,136 @@
+"""Files without pickle: SB3's zip layout with JSON data and plain arrays, so that loading one runs no code."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import gymnasium as gym
+import numpy as np
+import stable_baselines3
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+FORMAT = "mbagent-agent-1"
+
+Target = str | os.PathLike[str] | BinaryIO
+
+
+def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
+    """A discrete space as JSON data.
+
+    Raises:
+        TypeError: the space has no such form.
+    """
+    if isinstance(space, spaces.Discrete):
+        return {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
+    if isinstance(space, spaces.MultiDiscrete):
+        return {"type": "MultiDiscrete", "nvec": space.nvec.tolist(), "start": space.start.tolist(), "dtype": str(space.dtype)}
+    if isinstance(space, spaces.MultiBinary):
+        return {"type": "MultiBinary", "shape": list(space.shape)}
+    if isinstance(space, spaces.Box):
+        return {"type": "Box", "low": space.low.tolist(), "high": space.high.tolist(), "dtype": str(space.dtype)}
+    if isinstance(space, spaces.Dict):
+        return {"type": "Dict", "spaces": [[key, space_to_json(part)] for key, part in space.spaces.items()]}
+    if isinstance(space, spaces.Tuple):
+        return {"type": "Tuple", "spaces": [space_to_json(part) for part in space.spaces]}
+    raise TypeError(f"The space {space} cannot be written as JSON.")
+
+
+def space_from_json(data: Mapping[str, Any]) -> spaces.Space[Any]:
+    """The space that ``space_to_json`` wrote.
+
+    Raises:
+        ValueError: the data names no known space.
+    """
+    kind = data.get("type")
+    if kind == "Discrete":
+        return spaces.Discrete(data["n"], start=data["start"])
+    if kind == "MultiDiscrete":
+        return spaces.MultiDiscrete(np.array(data["nvec"]), start=np.array(data["start"]), dtype=np.dtype(data["dtype"]).type)
+    if kind == "MultiBinary":
+        shape = data["shape"]
+        return spaces.MultiBinary(shape if len(shape) > 1 else shape[0])
+    if kind == "Box":
+        dtype = np.dtype(data["dtype"])
+        return spaces.Box(np.array(data["low"], dtype=dtype), np.array(data["high"], dtype=dtype), dtype=dtype.type)
+    if kind == "Dict":
+        return spaces.Dict([(key, space_from_json(part)) for key, part in data["spaces"]])
+    if kind == "Tuple":
+        return spaces.Tuple([space_from_json(part) for part in data["spaces"]])
+    raise ValueError(f"The file names an unknown space {kind!r}; it was written by another program or version.")
+
+
+def write(target: Target, data: Mapping[str, Any], arrays: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
+    """Writes a zip with ``data`` as JSON and each group of ``arrays`` as an ``.npz`` of its own.
+
+    A path without suffix gets ``.zip``, as in SB3; missing folders are made. The file is complete or not there.
+    """
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", compression=zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("data", json.dumps({"format": FORMAT, **data}, indent=1))
+        for name, group in arrays.items():
+            part = io.BytesIO()
+            np.savez(part, allow_pickle=False, **group)
+            archive.writestr(f"{name}.npz", part.getvalue())
+        archive.writestr("_stable_baselines3_version", stable_baselines3.__version__)
+        archive.writestr("system_info.txt", f"- Gymnasium: {gym.__version__}\n- Numpy: {np.__version__}\n")
+    if not isinstance(target, str | os.PathLike):
+        target.write(buffer.getvalue())
+        return
+    path = Path(target)
+    path = path if path.suffix else path.with_suffix(".zip")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_bytes(buffer.getvalue())
+    temporary.replace(path)
+
+
+def read(source: Target) -> tuple[dict[str, Any], dict[str, dict[str, NDArray[Any]]]]:
+    """Reads what ``write`` wrote, as (data, arrays); nothing in the file is ever run.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is of another kind, or holds serialized code; the message names the entry.
+    """
+    if isinstance(source, str | os.PathLike):
+        path = Path(source)
+        source = path if path.exists() or path.suffix else path.with_suffix(".zip")
+        if not Path(source).exists():
+            raise FileNotFoundError(f"There is no file {source}; save an agent there first.")
+    try:
+        with zipfile.ZipFile(source) as archive:
+            names = archive.namelist()
+            data = json.loads(archive.read("data")) if "data" in names else {}
+            refuse_serialized(data, names)
+            if data.get("format") != FORMAT:
+                raise ValueError("This file was not saved by an mbagent agent; load it with the algorithm that saved it.")
+            arrays = {Path(name).stem: _arrays(archive.read(name)) for name in names if name.endswith(".npz")}
+    except (zipfile.BadZipFile, json.JSONDecodeError, KeyError) as error:
+        raise ValueError(f"This file is no saved agent, or is damaged: {error}.") from error
+    return data, arrays
+
+
+def refuse_serialized(data: Any, names: list[str]) -> None:
+    """Raises ValueError, naming the entry, if the file holds pickled objects, which would run code when read."""
+    for name in names:
+        if name.endswith((".pth", ".pt", ".pkl", ".pickle")):
+            raise ValueError(f"The file's entry {name!r} is a pickle, which runs code when read; mbagent files hold none.")
+    if not isinstance(data, dict):
+        raise ValueError("The file's entry 'data' is no JSON object; it was not saved by an mbagent agent.")
+    for key, value in data.items():
+        if isinstance(value, dict) and ":serialized:" in value:
+            raise ValueError(f"The file's entry {key!r} is serialized code; mbagent files hold none, so it is refused.")
+
+
+def _arrays(raw: bytes) -> dict[str, NDArray[Any]]:
+    try:
+        with np.load(io.BytesIO(raw), allow_pickle=False) as group:
+            return {name: group[name] for name in group.files}
+    except ValueError as error:
+        raise ValueError(f"The file holds an array that needs pickle or is damaged: {error}.") from error

@@ -1,0 +1,53 @@
+"""Flat Monte Carlo: the paper's basic search (section 4.1)."""
+
+from __future__ import annotations
+
+import numpy as np
+from mbagent_envs.random_keys import derive
+
+from mbagent.models.base import States, TransitionModel
+from mbagent.planning.goal import Goal
+from mbagent.planning.planner import Plan, PlannerSettings, best_actions
+from mbagent.planning.rollouts import random_returns
+
+
+class FlatMonteCarlo:
+    """Simulates random play after every action and takes the action whose simulations did best.
+
+    "Several simulations are rolled out up to a bounded number of steps using the transition sampling method. At the end
+    of each simulation the reward is counted, and the action which produced the greatest reward is selected."
+    By default an action is judged by the mean of its simulations; ``choice="greatest"`` is the paper's wording, which
+    seeks risk wherever the world is stochastic.
+    """
+
+    def __init__(self, settings: PlannerSettings) -> None:
+        """Takes the settings; a model and a goal must follow."""
+        self.settings = settings
+        self._model: TransitionModel | None = None
+        self._goal: Goal | None = None
+
+    def set_model(self, model: TransitionModel, start_states: States) -> None:
+        """See Planner."""
+        self._model = model
+
+    def set_goal(self, goal: Goal) -> None:
+        """See Planner."""
+        self._goal = goal
+
+    def plan(self, roots: States) -> Plan:
+        """See Planner. The simulations are shared out evenly over the actions."""
+        model, goal, settings = self._model, self._goal, self.settings
+        if model is None or goal is None:
+            raise RuntimeError("The planner has no model or no goal yet; call set_model and set_goal first.")
+        n_actions = model.n_actions
+        each = max(1, settings.num_simulations // n_actions)
+        shape = (len(roots), n_actions, each)
+        rows = np.repeat(np.arange(len(roots)), n_actions * each)
+        actions = np.tile(np.repeat(np.arange(n_actions), each), len(roots))
+        # Simulation k meets the same luck under every action.
+        luck = derive(np.full(each, settings.seed, dtype=np.uint64), np.arange(each))
+        keys = np.tile(luck, len(roots) * n_actions)
+        returns = random_returns(model, goal, roots[rows], keys, settings.horizon, settings.gamma, actions)
+        returns = returns.reshape(shape)
+        values = returns.mean(axis=2) if settings.choice == "mean" else returns.max(axis=2)
+        return Plan(best_actions(values), values, np.full(shape[:2], float(each)))

@@ -1,0 +1,105 @@
+"""The planner protocol, and the settings that planners share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+from numpy.typing import NDArray
+
+from mbagent.models.base import Actions, Floats, States, TransitionModel
+from mbagent.planning.goal import Goal
+
+
+@dataclass(frozen=True)
+class PlannerSettings:
+    """How planners spend their effort.
+
+    Attributes:
+        num_simulations: simulations for each decision.
+        gamma: discount of a step; below one.
+        horizon: steps a simulation looks ahead, at most.
+        max_states: reachable states up to which the whole machine is solved once, for all decisions.
+        lookahead_states: states imagined around each root where the whole machine is larger than that.
+        n_samples: draws for a (state, action) whose successors are too many to enumerate.
+        leaf_values: "machine" (values of the reachable machine) or "rollouts" (random play).
+        backup: "max" (an action is worth what the best behaviour after it is worth) or "mean" (plain UCT).
+        choice: "mean", or "greatest" as in the paper (flat Monte Carlo only; it seeks risk).
+        c_uct: weight of the search's exploration, in units of the range of values seen.
+        wave: simulations between two calls of the model.
+        prior_visits: how many visits a value from the machine counts for in the search.
+        seed: which random numbers.
+
+    Raises:
+        ValueError: a setting is out of range.
+    """
+
+    num_simulations: int = 64
+    gamma: float = 0.99
+    horizon: int = 20
+    max_states: int = 3000
+    lookahead_states: int = 384
+    n_samples: int = 16
+    leaf_values: Literal["machine", "rollouts"] = "machine"
+    backup: Literal["max", "mean"] = "max"
+    choice: Literal["mean", "greatest"] = "mean"
+    c_uct: float = 0.5
+    wave: int = 16
+    prior_visits: float = 8.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        for name in ("num_simulations", "horizon", "max_states", "lookahead_states", "n_samples", "wave"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")
+        if not 0.0 < self.gamma < 1.0:
+            raise ValueError(f"gamma must lie between 0 and 1, both excluded, got {self.gamma!r}.")
+        if self.c_uct < 0.0 or self.prior_visits < 0.0:
+            raise ValueError("c_uct and prior_visits must not be negative.")
+        choices = {"leaf_values": ("machine", "rollouts"), "backup": ("max", "mean"), "choice": ("mean", "greatest")}
+        for name, allowed in choices.items():
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name} must be one of {allowed}, got {getattr(self, name)!r}.")
+        if self.leaf_values == "rollouts" and self.backup == "max":
+            raise ValueError("leaf_values='rollouts' needs backup='mean': the maximum of random returns seeks luck.")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a planner found for each root.
+
+    Attributes:
+        actions: int64 [B], the best action.
+        values: float64 [B, A], estimated discounted return of each action.
+        visits: float64 [B, A], simulations through each action.
+    """
+
+    actions: Actions
+    values: Floats
+    visits: Floats
+
+
+class Planner(Protocol):
+    """Chooses actions by imagining with a model; the outcome is a pure function of (settings, model, goal, root)."""
+
+    def set_model(self, model: TransitionModel, start_states: States) -> None:
+        """Takes a (newly fitted) model and the start states int64 [S, F] seen; every cache is dropped."""
+        ...
+
+    def set_goal(self, goal: Goal) -> None:
+        """Takes a new goal; values of the old one are dropped, what was imagined of the world may stay."""
+        ...
+
+    def plan(self, roots: States) -> Plan:
+        """Plans from each root int64 [B, F]."""
+        ...
+
+
+def best_actions(scores: NDArray[Floats] | Floats) -> Actions:
+    """The first action [B] whose score [B, A] is the greatest but for rounding errors."""
+    top = scores.max(axis=1, keepdims=True)
+    slack = 1e-9 * abs(scores).max(axis=1, keepdims=True)
+    result: Actions = (scores >= top - slack).argmax(axis=1)
+    return result

@@ -1,0 +1,214 @@
+"""Planner policies: from an observation, by planning on the model, to an action."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from mbagent_envs.random_keys import derive
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import BasePolicy
+
+from mbagent.learned_reward import LearnedReward
+from mbagent.models.base import States, TransitionModel
+from mbagent.planning.flat_monte_carlo import FlatMonteCarlo
+from mbagent.planning.goal import Goal
+from mbagent.planning.machine_planner import MachinePlanner
+from mbagent.planning.mcts import MctsPlanner
+from mbagent.planning.planner import Plan, Planner, PlannerSettings
+from mbagent.spaces import ActionEnumeration, FactoredSpace
+
+NO_GOAL = (
+    "This agent was saved with a custom reward function, and files hold no code: give it again with "
+    "load(path, reward=fn) or agent.set_reward(fn)."
+)
+
+
+class PlannerPolicy(BasePolicy):
+    """An SB3 policy whose forward pass is a plan.
+
+    Its parameters are those of the transition model and of the learned reward; ``state_dict`` and ``load_state_dict``
+    reach both, and loading drops every planning cache.
+
+    Args:
+        observation_space: a discrete space (see FactoredSpace).
+        action_space: a discrete space (see ActionEnumeration).
+        lr_schedule: unused here; SB3 passes it.
+        model: the transition model.
+        reward_model: the learned reward.
+        settings: see PlannerSettings.
+    """
+
+    planner_class: ClassVar[type[Planner]] = MctsPlanner
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Any = None,
+        *,
+        model: TransitionModel,
+        reward_model: LearnedReward,
+        settings: PlannerSettings,
+    ) -> None:
+        """See the class."""
+        super().__init__(observation_space, action_space)
+        del lr_schedule
+        self.factored = FactoredSpace(observation_space)
+        self.actions = ActionEnumeration(action_space)
+        self.transition_model, self.reward_model, self.settings = model, reward_model, settings
+        self.planner: Planner = self.planner_class(settings)  # type: ignore[call-arg]
+        self.start_states: States = np.zeros((0, len(self.factored)), dtype=np.int64)
+        self.goal: Goal | None = None
+        self.fitted = False
+        self._warned = False
+        self._random = np.random.default_rng(int(derive(settings.seed, 0xAC71)[0]))
+
+    def refresh(self, goal: Goal | None = None) -> None:
+        """Drops every cache after new weights or start states; takes a new goal if one is given."""
+        self.planner.set_model(self.transition_model, self.start_states)
+        self.set_goal(goal if goal is not None else self.goal)
+
+    def set_goal(self, goal: Goal | None) -> None:
+        """Takes a goal (None: none is known, so ``predict`` refuses)."""
+        self.goal = goal
+        if goal is not None:
+            self.planner.set_goal(goal)
+
+    def plan(self, states: States) -> Plan:
+        """Plans from factored states int64 [B, F].
+
+        Raises:
+            ValueError: no goal is known.
+        """
+        if self.goal is None:
+            raise ValueError(NO_GOAL)
+        return self.planner.plan(states)
+
+    def predict(
+        self,
+        observation: Any,
+        state: tuple[NDArray[Any], ...] | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[Any, tuple[NDArray[Any], ...] | None]:
+        """The planner's best action for one observation or a batch.
+
+        Args:
+            observation: one observation of the space, or a batch of them.
+            state: passed through (the policy has no memory).
+            episode_start: ignored, as there is no memory.
+            deterministic: makes no difference: both mean the best action found.
+
+        Returns:
+            (action or batch of actions in the action space's own form, ``state``).
+
+        Raises:
+            ValueError: an observation outside the space, or no goal known (see ``NO_GOAL``).
+        """
+        batch, single = as_batch(self.observation_space, observation)
+        states = self.factored.encode(batch)
+        if self.fitted:
+            indices = self.plan(states).actions
+        else:
+            self._warn_unfitted()
+            indices = self._random.integers(self.actions.n, size=len(states))
+        actions = self.actions.decode(indices)
+        return (actions[0] if single else actions), state
+
+    def _warn_unfitted(self) -> None:
+        if not self._warned:
+            warnings.warn("This agent has learned nothing yet: its actions are random until learn() ends.", stacklevel=4)
+            self._warned = True
+
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        """Not used: see ``predict``."""
+        raise NotImplementedError("A planner policy has no forward pass; call predict().")
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> torch.Tensor:
+        actions, _ = self.predict(observation, deterministic=deterministic)
+        return torch.as_tensor(actions)
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, torch.Tensor]:  # type: ignore[override]
+        """Weights of the transition model ("model.…") and of the learned reward ("reward.…"), as tensors."""
+        return {name: torch.from_numpy(np.array(value)) for name, value in self.arrays().items()}
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """As ``state_dict``, as numpy arrays."""
+        parts = {"model": self.transition_model.state_dict(), "reward": self.reward_model.state_dict()}
+        return {f"{part}.{name}": value for part, state in parts.items() for name, value in state.items()}
+
+    def load_state_dict(  # type: ignore[override]
+        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
+    ) -> None:
+        """Takes weights over and drops every cache.
+
+        Raises:
+            ValueError: the weights do not fit; nothing is changed then.
+        """
+        del assign
+        arrays = {name: np.asarray(value) for name, value in state_dict.items()}
+        if not strict:
+            arrays = {**self.arrays(), **arrays}
+        unknown = [name for name in arrays if name.partition(".")[0] not in ("model", "reward")]
+        if unknown:
+            raise ValueError(f"There is no parameter called {unknown[0]!r}; take names from get_parameters()['policy'].")
+        self.transition_model.load_state_dict(_part(arrays, "model."))
+        reward = _part(arrays, "reward.")
+        if reward:
+            self.reward_model.load_state_dict(reward)
+        self.fitted = True
+        self.refresh()
+
+
+class MctsPolicy(PlannerPolicy):
+    """Monte Carlo tree search on the learned model (the default)."""
+
+    planner_class = MctsPlanner
+
+
+class FlatMonteCarloPolicy(PlannerPolicy):
+    """The paper's basic search: random play after every action (section 4.1)."""
+
+    planner_class = FlatMonteCarlo
+
+
+class ValueIterationPolicy(PlannerPolicy):
+    """Greedy on the values of the finite-state machine generated from the model (section 2)."""
+
+    planner_class = MachinePlanner
+
+
+def as_batch(space: spaces.Space[Any], observation: Any) -> tuple[Any, bool]:
+    """The observation as a batch, and whether it was a single one.
+
+    Raises:
+        ValueError: its shape is neither that of one observation of ``space`` nor of a batch of them.
+    """
+    if isinstance(space, spaces.Dict):
+        if not isinstance(observation, Mapping) or set(observation) != set(space.spaces):
+            raise ValueError(f"The observation must be a dict with the keys {sorted(space.spaces)}, got {observation!r}.")
+        parts = {key: as_batch(part, observation[key]) for key, part in space.spaces.items()}
+        return {key: batch for key, (batch, _) in parts.items()}, all(single for _, single in parts.values())
+    if isinstance(space, spaces.Tuple):
+        if not isinstance(observation, tuple | list) or len(observation) != len(space.spaces):
+            raise ValueError(f"The observation must be a tuple of {len(space.spaces)} parts, got {observation!r}.")
+        pairs = [as_batch(part, value) for part, value in zip(space.spaces, observation, strict=True)]
+        return tuple(batch for batch, _ in pairs), all(single for _, single in pairs)
+    array, shape = np.asarray(observation), tuple(space.shape or ())
+    if array.shape == shape:
+        return array[None], True
+    if array.shape[1:] == shape and array.ndim == len(shape) + 1:
+        return array, False
+    raise ValueError(
+        f"The observation has shape {array.shape}, but {space} needs {shape}, or (batch, {', '.join(map(str, shape))}) "
+        "for a batch; pass observations as the environment returns them."
+    )
+
+
+def _part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+    return {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}

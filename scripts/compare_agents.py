@@ -1,0 +1,94 @@
+"""Compares the model-learning agent with PPO, DQN and A2C; writes one HTML report and a table of all figures.
+
+python scripts/compare_agents.py            # quick: three trainings of each agent
+python scripts/compare_agents.py --full     # five trainings, and baselines also at ten times the steps
+
+"""
+
+from __future__ import annotations
+
+import os
+
+# Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import sys
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+
+from mbagent.analysis.cases import CASES, find_case
+from mbagent.analysis.comparison import FULL, QUICK, Settings, load, run
+from mbagent.analysis.report import write_report
+from mbagent.analysis.runner import JobsFailedError
+from mbagent.analysis.summary import save_csv, summarise
+
+
+@dataclass(frozen=True)
+class Args:
+    """Compare the model-learning agent with PPO, DQN and A2C."""
+
+    full: bool = False
+    """Five trainings, more episodes, and the baselines also at ten times the steps (hours, not minutes)."""
+    output: Path = Path("results/compare")
+    """Folder for report.html, results.csv and the records of every training."""
+    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
+    """Number of processes, each with one thread."""
+    cases: tuple[str, ...] = tuple(case.key for case in CASES)
+    """Which environments."""
+    steps: int | None = None
+    """Environment steps for learning; by default 50,000."""
+    seeds: int | None = None
+    """Independent trainings of each agent; by default 3, with --full 5."""
+    episodes: int | None = None
+    """Episodes played after each training; by default 40, with --full 100."""
+    resume: bool = False
+    """Go on with an interrupted run of the same settings instead of starting anew."""
+    report_only: bool = False
+    """Only write the report anew, from the records of the last run with the same settings."""
+
+
+def settings_of(args: Args) -> Settings:
+    """The comparison's settings that the options stand for."""
+    chosen = FULL if args.full else QUICK
+    given: dict[str, Any] = {"steps": args.steps, "seeds": args.seeds, "episodes": args.episodes}
+    chosen = replace(chosen, **{name: value for name, value in given.items() if value is not None})
+    cases = tuple(find_case(key).key for key in args.cases)
+    return replace(chosen, cases=cases, curve_steps=tuple(s for s in chosen.curve_steps if s < chosen.steps))
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command line and returns its exit code."""
+    args = tyro.cli(Args, args=argv, description=__doc__)
+    console = Console()
+    try:
+        settings = settings_of(args)
+        start = time.perf_counter()
+        if args.report_only:
+            records = load(args.output)
+        else:
+            records = run(settings, args.output, workers=args.workers, console=console, resume=args.resume)
+    except (ValueError, JobsFailedError) as error:
+        console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
+        return 1
+    console.print("Summing up and drawing ...")
+    results = summarise(records, settings)
+    save_csv(args.output / "results.csv", records, results)
+    given = sys.argv[1:] if argv is None else argv
+    write_report(
+        args.output / "report.html",
+        results,
+        settings,
+        command=" ".join(["python scripts/compare_agents.py", *given]),
+        minutes=(time.perf_counter() - start) / 60,
+    )
+    console.print(f"Wrote {args.output / 'report.html'} and {args.output / 'results.csv'}.")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
