@@ -45,7 +45,7 @@ class Args:
     seeds: int | None = None
     """Independent trainings of each agent; by default 3, with --full 5."""
     episodes: int | None = None
-    """Episodes played after each training; by default 40, with --full 100."""
+    """Episodes after each training, more where there are few states; by default 10, with --full 20."""
     resume: bool = False
     """Go on with an interrupted run of the same settings instead of starting anew."""
     report_only: bool = False

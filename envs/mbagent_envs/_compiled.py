@@ -1,4 +1,8 @@
-"""Numba's decorator with types: compiled on first use, kept on disk, and free of the interpreter lock."""
+"""Numba's decorator with types: compiled on first use, kept on disk, and free of the interpreter lock.
+
+Numba renews what it keeps when the file of a function changes, not when a compiled function that it calls
+from another file does: after a change in `mbagent_envs.random_keys` delete ``envs/mbagent_envs/__pycache__``.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 from collections.abc import Mapping
 from typing import Any
@@ -97,8 +98,8 @@ class GameEnv(gym.Env[Bits, np.int64]):
     ) -> None:
         self.game = resolve_game(game, arguments)
         self.render_mode = check_render_mode(render_mode)
-        self.observation_space = self.game.observation_space
-        self.action_space = self.game.action_space
+        self.observation_space = copy.deepcopy(self.game.observation_space)  # environments may share a game,
+        self.action_space = copy.deepcopy(self.game.action_space)  # but never their spaces' generators
         self._obs: Bits | None = None
         self._episode_key = np.zeros(1, dtype=np.uint64)
         self._elapsed = 0

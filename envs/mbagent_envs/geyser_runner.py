@@ -128,7 +128,12 @@ class GeyserRunner(Game):
         names = tuple(name for name in moves if self.stay or name != "stay")
         self._moves = np.array([moves[name] for name in names], dtype=np.int8)
         self._values = np.arange(self.width) / (self.width - 1)
-        goals = {"left": self._left, "middle": self._middle, "spray": self._spray, "right edge": self._right_edge}
+        goals = {
+            "left": self._left,
+            "middle": self._middle,
+            "spray": self._spray,
+            "right edge": self._right_edge,
+        }
         super().__init__(observation_shape=(self.width + geysers,), action_names=names, goals=goals)
 
     def initial(self, keys: KeyArray) -> Bits:

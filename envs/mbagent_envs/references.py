@@ -36,10 +36,9 @@ def reference_policy(
         gamma: discount of the plan, in [0, 1).
 
     Returns:
-        GeyserRunner: the optimum of the discounted infinite horizon (value iteration over all states).
-            Maneuverer: the shortest way
-        to what the goal rewards within the layout, with the average layout's value behind the target.
-        FlierCatcher: the best path among the fliers in view.
+        For GeyserRunner the optimum of the discounted infinite horizon (value iteration over all states); for
+        Maneuverer the shortest way to what the goal rewards within the layout, with the average layout's
+        value behind the target; for FlierCatcher the best path among the fliers in view.
 
     Raises:
         ValueError: if there is no goal of that name, or ``gamma`` is outside [0, 1).
@@ -123,31 +122,30 @@ class _LayoutPlanner:
         self._game, self._reward, self._gamma = game, reward, gamma
         cells = game.size**2
         self._chunk = 1 + 2_000_000 // cells**2  # layouts looked at together: bounds the memory
-        samples = max(
-            4, 600 // cells
-        )  # layouts drawn around each cell: their mean is what lies behind the target
         self._plans: dict[bytes, Ints] = {}  # walls and target -> action for each cell
+        self._redrawn = self._value_of_redrawing(max(4, 600 // cells))
+
+    def _value_of_redrawing(self, samples: int) -> Floats:
+        """Return what it is worth to have reached the target at each cell, ``[cells]``.
+
+        That is the mean over ``samples`` layouts drawn around the cell, whose own values count on it again.
+        """
+        game, gamma, cells = self._game, self._gamma, self._game.size**2
         around = np.zeros((cells * samples, *game.observation_space.shape), dtype=np.int8)
-        around[:, 0] = np.repeat(np.eye(cells, dtype=np.int8), samples, axis=0).reshape(
-            -1, game.size, game.size
-        )
-        around[:, 2] = around[:, 0]
-        drawn = game.transition(
-            around, np.zeros(len(around), dtype=np.int64), derive(0, np.arange(len(around)))
-        )
-        earned = (
-            reward(around, np.zeros(len(around), dtype=np.int64), drawn).reshape(cells, samples).mean(axis=1)
-        )
-        self._redrawn = np.zeros(cells)  # value of having reached the target at each cell
+        places = np.eye(cells, dtype=np.int8).reshape(cells, game.size, game.size)
+        around[:, 0] = around[:, 2] = np.repeat(places, samples, axis=0)
+        actions, keys = np.zeros(len(around), dtype=np.int64), derive(0, np.arange(len(around)))
+        drawn = game.transition(around, actions, keys)
+        earned = self._reward(around, actions, drawn).reshape(cells, samples).mean(axis=1)
         problem = self._problem(drawn)
-        values = np.zeros((len(drawn), cells))
+        redrawn, values = np.zeros(cells), np.zeros((len(drawn), cells))
         for _ in range(1000):
-            _solve(*problem, self._redrawn, gamma, 1e-6, values)
+            _solve(*problem, redrawn, gamma, 1e-6, values)
             own = values.reshape(cells, samples, cells)[np.arange(cells), :, np.arange(cells)].mean(axis=1)
-            change = np.abs(earned + gamma * own - self._redrawn).max()
-            self._redrawn = earned + gamma * own
-            if change < 1e-4 * (1 + np.abs(own).max()):
+            before, redrawn = redrawn, earned + gamma * own
+            if np.abs(redrawn - before).max() < 1e-4 * (1 + np.abs(own).max()):
                 break
+        return redrawn
 
     def __call__(self, obs: Bits) -> Ints:
         """Return the best action of each row."""
@@ -201,9 +199,15 @@ class _LayoutPlanner:
 
 @compiled
 def _solve(
-    next_cell: Ints, earned: Floats, target: Ints, redrawn: Floats, gamma: float, values: Floats
+    next_cell: Ints,
+    earned: Floats,
+    target: Ints,
+    redrawn: Floats,
+    gamma: float,
+    tolerance: float,
+    values: Floats,
 ) -> None:
-    """Improve the state values ``[B, cells]`` in place until they are optimal, the target's being fixed."""
+    """Improve the state values ``[B, cells]`` in place until they are optimal, the targets' being fixed."""
     batch, cells, n_actions = earned.shape
     for b in range(batch):
         for _ in range(100_000):

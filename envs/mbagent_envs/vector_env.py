@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any
 
@@ -61,8 +62,8 @@ class GameVectorEnv(gym.vector.VectorEnv[Bits, npt.NDArray[Any], npt.NDArray[Any
         self.max_episode_steps = limit if limit == -1 else check_integer("max_episode_steps", limit, 1)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**type(self).metadata, "autoreset_mode": self.autoreset_mode}
-        self.single_observation_space = self.game.observation_space
-        self.single_action_space = self.game.action_space
+        self.single_observation_space = copy.deepcopy(self.game.observation_space)
+        self.single_action_space = copy.deepcopy(self.game.action_space)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._generators: list[np.random.Generator | None] = [None] * self.num_envs

@@ -31,6 +31,7 @@ class Case:
         steps_limit: environment steps for learning; None for the comparison's own number.
         change_goals: whether the change-of-goal experiment is run on it.
         reward_given: whether the agent may read the environment's reward function; it learns one otherwise.
+        episodes: reporting episodes are multiplied by this: where there are few states, many cost little.
     """
 
     key: str
@@ -43,6 +44,7 @@ class Case:
     steps_limit: int | None = None
     change_goals: bool = False
     reward_given: bool = True
+    episodes: int = 1
 
     def make_env(self, **more: Any) -> gym.Env[Any, Any]:
         """A new environment."""
@@ -70,6 +72,7 @@ CASES: tuple[Case, ...] = (
         + "The eruptions follow a fixed pattern: the best player runs right and steps aside just in time.",
         _OPTIMUM,
         change_goals=True,
+        episodes=5,
     ),
     Case(
         "geyser_low_cost",
@@ -80,6 +83,7 @@ CASES: tuple[Case, ...] = (
         + "The eruptions are random and hits are cheap: the best player runs to the far right and stays.",
         _OPTIMUM,
         change_goals=True,
+        episodes=5,
     ),
     Case(
         "geyser_high_cost",
@@ -89,6 +93,7 @@ CASES: tuple[Case, ...] = (
         _GEYSER_TEXT.format(cost=5)
         + "The eruptions are random and hits are expensive: the best player sits on the last safe column.",
         _OPTIMUM,
+        episodes=5,
     ),
     Case(
         "maneuverer",
@@ -99,6 +104,7 @@ CASES: tuple[Case, ...] = (
         "around it, so that almost every layout is one it has never seen. One point for each target.",
         "shortest paths",
         exact=False,
+        episodes=2,
         change_goals=True,
     ),
     Case(
@@ -122,6 +128,7 @@ CASES: tuple[Case, ...] = (
         "the exact optimum, by dynamic programming over 100 steps",
         steps_limit=20_000,
         reward_given=False,
+        episodes=50,
     ),
 )
 """The cases of the comparison, in the report's order."""

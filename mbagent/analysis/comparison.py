@@ -33,7 +33,8 @@ class Settings:
     Attributes:
         steps: environment steps for learning (fewer where a case says so).
         seeds: independent trainings of each learning agent.
-        episodes: reporting episodes for each training.
+        episodes: reporting episodes for each training, multiplied by the case's own number.
+        goal_episodes: the same for each new goal.
         baseline_multiples: the baselines train for these multiples of the steps.
         curve_steps: the agent is also trained afresh for so many steps, for its learning curve.
         curve_seeds: trainings for each of these points.
@@ -44,9 +45,10 @@ class Settings:
 
     steps: int = 50_000
     seeds: int = 3
-    episodes: int = 40
+    episodes: int = 10
+    goal_episodes: int = 5
     baseline_multiples: tuple[int, ...] = (1,)
-    curve_steps: tuple[int, ...] = (1_000, 5_000, 20_000)
+    curve_steps: tuple[int, ...] = (1_000, 10_000)
     curve_seeds: int = 1
     goal_seeds: int = 1
     scale_episodes: int = 1000
@@ -54,7 +56,15 @@ class Settings:
 
 
 QUICK = Settings()
-FULL = Settings(seeds=5, episodes=100, baseline_multiples=(1, 10), curve_seeds=5, goal_seeds=5)
+FULL = Settings(
+    seeds=5,
+    episodes=20,
+    goal_episodes=20,
+    baseline_multiples=(1, 10),
+    curve_steps=(1_000, 2_000, 5_000, 10_000, 20_000),
+    curve_seeds=5,
+    goal_seeds=5,
+)
 
 
 def plan_jobs(settings: Settings) -> list[Job]:
@@ -62,8 +72,7 @@ def plan_jobs(settings: Settings) -> list[Job]:
     jobs: list[Job] = []
     for case in map(find_case, settings.cases):
         steps = case.steps(settings.steps)
-        # A game without batched rules is small: many episodes of its all-or-nothing returns cost little.
-        episodes = settings.episodes if case.reward_given else 20 * settings.episodes
+        episodes = case.episodes * settings.episodes
         jobs.append(Job(REFERENCE, case.key, 0, 0, settings.scale_episodes, all_goals(case)))
         for seed in range(settings.seeds):
             goals = all_goals(case) if seed < settings.goal_seeds else ("default",)
@@ -74,20 +83,21 @@ def plan_jobs(settings: Settings) -> list[Job]:
 def _jobs_of_seed(
     settings: Settings, case: Case, seed: int, steps: int, episodes: int, goals: tuple[str, ...]
 ) -> list[Job]:
+    agent = AGENT if case.reward_given else LEARNED_REWARD
     jobs = [
-        Job(RANDOM, case.key, seed, 0, episodes, goals),
-        Job(LEARNED_REWARD, case.key, seed, steps, episodes),
+        Job(RANDOM, case.key, seed, 0, episodes),
+        Job(agent, case.key, seed, steps, episodes, goals, case.episodes * settings.goal_episodes),
     ]
     if case.reward_given:
-        jobs.append(Job(AGENT, case.key, seed, steps, episodes, goals))
-        jobs.append(Job(TRUE_MODEL, case.key, seed, 0, episodes, goals))
+        jobs.append(
+            Job(TRUE_MODEL, case.key, seed, 0, episodes, goals, case.episodes * settings.goal_episodes)
+        )
     jobs += [
         Job(name, case.key, seed, steps * multiple, episodes)
         for name in BASELINES
         for multiple in settings.baseline_multiples
     ]
     if seed < settings.curve_seeds:
-        agent = AGENT if case.reward_given else LEARNED_REWARD
         jobs += [
             Job(agent, case.key, seed, fewer, episodes, curve=True)
             for fewer in settings.curve_steps

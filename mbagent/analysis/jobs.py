@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Any, SupportsFloat, cast
 
 import gymnasium as gym
@@ -43,6 +44,7 @@ class Job:
         steps: environment steps for learning.
         episodes: reporting episodes.
         goals: names of the goals to score.
+        goal_episodes: reporting episodes for each goal but the default one.
         curve: whether this is only a point of the agent's learning curve.
     """
 
@@ -52,6 +54,7 @@ class Job:
     steps: int
     episodes: int
     goals: tuple[str, ...] = ("default",)
+    goal_episodes: int = 0
     curve: bool = False
 
     @property
@@ -170,17 +173,41 @@ def _plan_on_true_model(job: Job, case: Case, report: Report | None) -> list[Rec
 
 
 def _learn_and_plan(job: Job, case: Case, report: Report | None) -> list[Record]:
-    env = RewardOnly(case.make_env()) if job.agent == LEARNED_REWARD else case.make_env()
+    env = case.make_env() if case.reward_given else RewardOnly(case.make_env())
     start = time.perf_counter()
-    with warnings.catch_warnings():
-        # The agent rightly warns that it has to learn the reward; here that is the experiment.
-        warnings.filterwarnings("ignore", message=".*reward.*")
+    with _reward_warnings_ignored():
         agent = ModelLearningAgent("MctsPolicy", env, seed=job.seed)
-        exploring = None if report is None else lambda share: report(0.3 * share)
+        exploring = None if report is None else _part(report, 0, 3)
         agent.learn(total_timesteps=job.steps, callback=_ReportSteps(job.steps, exploring))
     seconds = time.perf_counter() - start
-    planning = None if report is None else lambda share: report(0.5 + 0.5 * share)
-    return _score_goals(job, case, agent, seconds, planning)
+    planning = None if report is None else _part(report, 1, 2)
+    records = _score_goals(job, case, agent, seconds, planning)
+    if case.reward_given and not job.curve:
+        records += _learn_reward_too(job, case, agent, seconds)
+    return records
+
+
+def _learn_reward_too(job: Job, case: Case, agent: ModelLearningAgent, seconds: float) -> list[Record]:
+    """The same agent once more, with only the rewards it met while exploring to learn the goal from.
+
+    Rewards never steer exploration and never touch the transition model, so learning anew without the reward
+    function would give the same model, byte for byte.
+    """
+    start = time.perf_counter()
+    with _reward_warnings_ignored():
+        agent.set_env(RewardOnly(case.make_env()))
+        agent.set_reward(None)
+    seconds += time.perf_counter() - start
+    default = replace(job, agent=LEARNED_REWARD, goals=("default",))
+    return _score_goals(default, case, agent, seconds, None)
+
+
+@contextmanager
+def _reward_warnings_ignored() -> Iterator[None]:
+    """The agent rightly warns that it has to learn the reward; here that is the experiment."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*reward.*", category=UserWarning)
+        yield
 
 
 def _score_goals(
@@ -202,7 +229,7 @@ def _score_goals(
         played = play(
             case,
             policy,
-            episodes=job.episodes,
+            episodes=job.episodes if goal == "default" else job.goal_episodes,
             seed=job.seed,
             goals=(goal,),
             repeatable=True,

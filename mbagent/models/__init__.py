@@ -1,8 +1,9 @@
 """Transition models: the paper's predictor and conditioner, tables, and the true simulator behind one protocol."""
 
 from mbagent.models.base import BaseTransitionModel, FitReport, Successors, TransitionModel
+from mbagent.models.config import NeuralConfig
 from mbagent.models.networks import Conditioner, DensePredictor, FactorCodec, Predictor
-from mbagent.models.neural import NeuralConfig, NeuralTransitionModel
+from mbagent.models.neural import NeuralTransitionModel
 from mbagent.models.simulator import SimulatorModel
 from mbagent.models.training import TrainingConfig
 

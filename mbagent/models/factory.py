@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from mbagent.models.base import TransitionModel
-from mbagent.models.neural import NeuralConfig, NeuralTransitionModel
+from mbagent.models.config import NeuralConfig
+from mbagent.models.neural import NeuralTransitionModel
 from mbagent.models.planes import PlanePredictor
 from mbagent.models.training import TrainingConfig
 from mbagent.spaces import FactoredSpace

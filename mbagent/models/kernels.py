@@ -61,18 +61,20 @@ class DenseWeights(NamedTuple):
 
 
 class GroupWeights(NamedTuple):
-    """A ``Conditioner``.
+    """A ``Conditioner`` with g groups.
 
     Attributes:
-        inputs: from (state, action) columns to group i, [O, n_inputs, G].
-        others: from the next factors' columns to group i, zero where pruned, [O, n_columns, G].
-        bias: [O, G].
-        readout: from group i to the logits of factor i, [O, G, K].
-        offset: [O, K].
+        group_of: group of each output factor, -1 where it has none, int64 [O].
+        inputs: from (state, action) columns, [g, n_inputs, G].
+        others: from the next factors' columns, zero where pruned, [g, n_columns, G].
+        bias: [g, G].
+        readout: to the logits of the group's factor, [g, G, K].
+        offset: [g, K].
         activation: one of the codes above.
         correction: whether the predictor's logits are added.
     """
 
+    group_of: Ints
     inputs: Floats32
     others: Floats32
     bias: Floats32
@@ -183,6 +185,15 @@ def softmax(logits: Floats32, n: int, out: Floats) -> None:
 def probabilities(logits: Floats32, outputs: Ints) -> Floats:
     """Each factor's distribution, float64 [B, O, K], from logits [B, O, K]; 0 for values a factor lacks."""
     out = np.zeros(logits.shape, dtype=np.float64)
+    if logits.shape[2] == 2:  # written out, since slices of arrays cost more than the arithmetic
+        for b in range(logits.shape[0]):
+            for i in range(logits.shape[1]):
+                difference = np.float64(logits[b, i, 1]) - np.float64(logits[b, i, 0])
+                small = math.exp(-abs(difference))
+                large = 1.0 / (1.0 + small)
+                out[b, i, 1] = large if difference > 0 else small * large
+                out[b, i, 0] = small * large if difference > 0 else large
+        return out
     for b in range(logits.shape[0]):
         for i in range(logits.shape[1]):
             softmax(logits[b, i], outputs[i], out[b, i])
@@ -202,15 +213,19 @@ def conditional(
     logits: Floats32,
     out: Floats,
 ) -> None:
-    """Writes P(y_i | s, a, y_<i) to ``out``; ``base`` [K] are the predictor's logits, ``factors`` [O] holds y_<i."""
-    hidden[:] = group.bias[i]
+    """Writes P(y_i | s, a, y_<i) to ``out``, for a factor that has a group.
+
+    ``base`` [K] are the predictor's logits, ``factors`` [O] holds y_<i, ``hidden`` [G] and ``logits`` [K] are work space.
+    """
+    g = group.group_of[i]
+    hidden[:] = group.bias[g]
     for a in range(n_active):
-        hidden += group.inputs[i, active[a]]
+        hidden += group.inputs[g, active[a]]
     for j in range(i):
         if layout.outputs[j] != 2:
-            hidden += group.others[i, layout.start[j] + factors[j]]
+            hidden += group.others[g, layout.start[j] + factors[j]]
         elif factors[j] == 1:
-            hidden += group.others[i, layout.start[j]]
+            hidden += group.others[g, layout.start[j]]
     finish(i, base, layout, group, hidden, logits, out)
 
 
@@ -218,13 +233,29 @@ def conditional(
 def finish(
     i: int, base: Floats32, layout: Layout, group: GroupWeights, hidden: Floats32, logits: Floats32, out: Floats
 ) -> None:
-    """From the summed input of group i (overwritten) to the distribution of factor i."""
-    n = layout.outputs[i]
+    """From the summed input of factor i's group (overwritten) to the factor's distribution."""
+    n, g = layout.outputs[i], group.group_of[i]
     _activate(hidden, len(hidden), group.activation)
     for k in range(n):
-        logits[k] = group.offset[i, k] + (base[k] if group.correction else np.float32(0.0))
+        logits[k] = group.offset[g, k] + (base[k] if group.correction else np.float32(0.0))
     for h in range(len(hidden)):
         value = hidden[h]
         for k in range(n):
-            logits[k] += value * group.readout[i, h, k]
+            logits[k] += value * group.readout[g, h, k]
     softmax(logits, n, out)
+
+
+@compiled
+def largest(values: Floats, n: int) -> int:
+    """Index of the largest of the first ``n`` values."""
+    best = 0
+    for k in range(1, n):
+        if values[k] > values[best]:
+            best = k
+    return best
+
+
+@compiled
+def trusted(i: int, values: Floats, layout: Layout, group: GroupWeights, certain: float) -> bool:
+    """Whether factor i is left to the predictor, which gives it the distribution ``values``."""
+    return bool(group.group_of[i] < 0 or values[largest(values, layout.outputs[i])] >= certain)

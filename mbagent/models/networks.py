@@ -136,6 +136,28 @@ class Affine(nn.Module):
         return functional.linear(values, weight, self.bias)
 
 
+class Dropout(nn.Module):
+    """Zeroes a share of its inputs while a generator is set, and nothing otherwise.
+
+    ``nn.Dropout`` would draw from the process-wide generator. The trainer sets and removes ``generator``.
+
+    Args:
+        share: of the inputs that is zeroed, 0 ... 1; the rest is scaled up to keep the mean.
+    """
+
+    def __init__(self, share: float) -> None:
+        super().__init__()
+        self.share = share
+        self.generator: torch.Generator | None = None
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Values of the same shape."""
+        if self.generator is None or self.share == 0.0:
+            return values
+        kept = torch.empty_like(values).bernoulli_(1.0 - self.share, generator=self.generator)
+        return values * kept.mul_(1.0 / (1.0 - self.share))
+
+
 class DensePredictor(nn.Module):
     """The predictor network (paper 3.1): state and action in, each next factor's logits out, all connected to all.
 
@@ -144,6 +166,7 @@ class DensePredictor(nn.Module):
         hidden: sizes of the hidden layers (the paper: one of 2d + 1).
         activation: of the hidden nodes (the paper: sigmoid).
         residual: adds a learned path from each s_i to s'_i, one weight for each (action, factor).
+        dropout: share of hidden nodes zeroed in each training step.
         generator: source of the first weights.
     """
 
@@ -153,6 +176,7 @@ class DensePredictor(nn.Module):
         hidden: Sequence[int] = (128,),
         activation: Activation = "silu",
         residual: bool = True,
+        dropout: float = 0.0,
         *,
         generator: torch.Generator,
     ) -> None:
@@ -161,6 +185,7 @@ class DensePredictor(nn.Module):
         self.activation = activation
         sizes = (codec.n_inputs, *hidden)
         self.layers = nn.ModuleList(Affine(a, b, generator) for a, b in zip(sizes, sizes[1:], strict=False))
+        self.dropout = Dropout(dropout)
         self.out = Affine(sizes[-1], codec.n_columns, generator)
         if residual:
             self.out.weight.data *= 0.1  # start near "nothing changes"
@@ -172,7 +197,7 @@ class DensePredictor(nn.Module):
         """See Predictor."""
         inputs = values = self.codec.inputs(states, actions)
         for layer in self.layers:
-            values = ACTIVATIONS[self.activation](layer(values))
+            values = self.dropout(ACTIVATIONS[self.activation](layer(values)))
         columns = self.out(values)
         if self.stay is not None:
             n = self.codec.n_state_columns
@@ -184,8 +209,9 @@ class DensePredictor(nn.Module):
 class Conditioner(nn.Module):
     """The conditioner network (paper 3.2): output i is the distribution of y_i given (s, a) and other next factors.
 
-    One hidden layer in O groups. Group i sees (s, a) and, of the next factors, y_<i (mask "causal") or all but y_i (mask
-    "others"); output i reads group i and nothing else, so nothing of y_i reaches output i.
+    One hidden layer in groups, one group an output. Group i sees (s, a) and, of the next factors, y_<i (mask "causal") or all
+    but y_i (mask "others"); output i reads group i and nothing else, so nothing of y_i reaches output i. Outputs that the
+    predictor leaves no doubt about need no group: their logits are 0 here, and nothing is added to the predictor's.
 
     Args:
         codec: the factors.
@@ -193,6 +219,8 @@ class Conditioner(nn.Module):
         group_size: hidden nodes G in a group (the paper: 2d, of 2d^2 + 1 in all).
         activation: of the hidden nodes.
         correction: outputs start at zero, since they are added to the predictor's logits; False: they stand alone (the paper).
+        dropout: share of hidden nodes zeroed in each training step.
+        grouped: bool [O], which outputs have a group; None: all. Needs ``correction``.
         generator: source of the first weights.
     """
 
@@ -203,23 +231,28 @@ class Conditioner(nn.Module):
         group_size: int = 16,
         activation: Activation = "silu",
         correction: bool = True,
+        dropout: float = 0.0,
+        grouped: Tensor | None = None,
         *,
         generator: torch.Generator,
     ) -> None:
         super().__init__()
         self.codec = codec
-        self.mask_kind: Mask = mask
         self.group_size = group_size
         self.activation = activation
         self.correction = correction
-        visible = group_mask(codec, mask, group_size)
+        self.grouped: Tensor
+        everything = torch.ones(len(codec.outputs), dtype=torch.bool)
+        self.register_buffer("grouped", everything if grouped is None or not correction else grouped.clone())
+        self.members = torch.nonzero(self.grouped)[:, 0]
+        visible = group_mask(codec, mask, group_size, self.members)
         fan_in = codec.n_inputs + codec.n_columns // 2
         self.groups = Affine(codec.n_inputs + codec.n_columns, len(visible), generator, visible, fan_in)
+        self.dropout = Dropout(dropout)
         n_values = 1 if codec.all_binary else codec.width
         bound = 0.0 if correction else 1.0 / math.sqrt(group_size)
-        shape = (len(codec.outputs), group_size, n_values)
-        self.readout = nn.Parameter(uniform(shape, bound, generator))
-        self.offset = nn.Parameter(uniform((len(codec.outputs), 1, n_values), bound, generator))
+        self.readout = nn.Parameter(uniform((len(self.members), group_size, n_values), bound, generator))
+        self.offset = nn.Parameter(uniform((len(self.members), 1, n_values), bound, generator))
 
     def forward(self, states: Tensor, actions: Tensor, next_factors: Tensor) -> Tensor:
         """Logits [B, O, K] from states int64 [B, F], actions int64 [B], next_factors int64 [B, O] (see ``from_columns``)."""
@@ -227,19 +260,22 @@ class Conditioner(nn.Module):
 
     def from_columns(self, inputs: Tensor, targets: Tensor) -> Tensor:
         """Logits [B, O, K] from columns of (s, a) [B, n_inputs] and of the next factors [B, n_columns], bits or guesses."""
-        n_outputs = len(self.codec.outputs)
+        codec, n_groups = self.codec, len(self.members)
         hidden = ACTIVATIONS[self.activation](self.groups(torch.cat((inputs, targets), dim=1)))
-        grouped = hidden.view(-1, n_outputs, self.group_size).transpose(0, 1)
+        grouped = self.dropout(hidden).view(len(inputs), n_groups, self.group_size).transpose(0, 1)
         values = (torch.bmm(grouped, self.readout) + self.offset).transpose(0, 1)
-        if self.codec.all_binary:
-            return self.codec.logits(values[:, :, 0])
-        return values + self.codec.floor
+        if n_groups < len(codec.outputs):
+            spread = values.new_zeros(len(values), len(codec.outputs), values.shape[2])
+            values = spread.index_copy(1, self.members, values)
+        if codec.all_binary:
+            return codec.logits(values[:, :, 0])
+        return values + codec.floor
 
 
-def group_mask(codec: FactorCodec, mask: Mask, group_size: int) -> Tensor:
-    """Which inputs each hidden node of a conditioner sees: bool [O * group_size, n_inputs + n_columns]."""
-    outputs = torch.arange(len(codec.outputs))[:, None]
-    seen = codec.column_factor < outputs if mask == "causal" else codec.column_factor != outputs
+def group_mask(codec: FactorCodec, mask: Mask, group_size: int, outputs: Tensor) -> Tensor:
+    """Which inputs each hidden node of the groups of ``outputs`` sees: bool [groups * group_size, n_inputs + n_columns]."""
+    own = outputs[:, None]
+    seen = codec.column_factor < own if mask == "causal" else codec.column_factor != own
     everything = torch.ones(len(outputs), codec.n_inputs, dtype=torch.bool)
     return torch.cat((everything, seen), dim=1).repeat_interleave(group_size, dim=0)
 

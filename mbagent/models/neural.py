@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -23,64 +22,17 @@ from mbagent.models.base import (
     Successors,
     as_keys,
 )
-from mbagent.models.kernels import DenseWeights, Floats32, GroupWeights, dense_logits, probabilities
-from mbagent.models.networks import Activation, Conditioner, DensePredictor, FactorCodec, Mask
-from mbagent.models.packing import pack_dense, pack_groups, pack_layout
+from mbagent.models.config import NeuralConfig
+from mbagent.models.kernels import Floats32, GroupWeights, probabilities
+from mbagent.models.networks import Conditioner, DensePredictor, FactorCodec
+from mbagent.models.packing import CompiledBody, compiled_body, pack_groups, pack_layout
 from mbagent.models.samplers import log_prob_causal, sample_causal, sample_independent, sample_sweeps
 from mbagent.models.systematic import causal_successors, independent_successors
-from mbagent.models.training import Trainer, TrainingConfig, as_examples, examples
+from mbagent.models.training import Examples, Trainer, as_examples, examples
 from mbagent.transitions import TransitionDataset
 
 BodyFactory: TypeAlias = Callable[[FactorCodec, torch.Generator], nn.Module]
 """Builds a predictor body (see ``networks.Predictor``); all its first weights must come from the generator."""
-
-CHUNK = 64
-"""Rows that a torch body is evaluated on at once, always this many: matrix products round differently in other sizes."""
-
-
-@dataclass(frozen=True)
-class NeuralConfig:
-    """What the networks look like and how they are used.
-
-    Attributes:
-        hidden: sizes of the dense predictor's hidden layers.
-        activation: of all hidden nodes.
-        residual: whether the predictor has a learned path from s_i to s'_i.
-        conditioner: "causal" (ancestral sampling, exact probabilities), "others" (the paper's sweeps), or None (factors
-            independent given state and action).
-        group_size: hidden nodes in each of the conditioner's groups.
-        correction: whether the conditioner's output is added to the predictor's logits.
-        certain: a factor whose likeliest value has this probability in the predictor's eyes is left to the predictor.
-        sweeps: passes over all factors, mask "others".
-        real_guess: whether the first guess is the predictor's probabilities rather than bits drawn from them.
-        training: see TrainingConfig.
-    """
-
-    hidden: tuple[int, ...] = (128,)
-    activation: Activation = "silu"
-    residual: bool = True
-    conditioner: Mask | None = "causal"
-    group_size: int = 16
-    correction: bool = True
-    certain: float = 0.999
-    sweeps: int = 5
-    real_guess: bool = False
-    training: TrainingConfig = field(default_factory=TrainingConfig)
-
-    @classmethod
-    def paper(cls, n_variables: int) -> NeuralConfig:
-        """Section 3's networks as they stand, for d = ``n_variables``: 2d + 1 and 2d^2 hidden nodes, sigmoids, squared error."""
-        return cls(
-            hidden=(2 * n_variables + 1,),
-            activation="sigmoid",
-            residual=False,
-            conditioner="others",
-            group_size=2 * n_variables,
-            correction=False,
-            certain=1.0,
-            training=TrainingConfig(learning_rate=0.03, weight_decay=0.0, loss="squared"),
-        )
-
 
 class NeuralTransitionModel(BaseTransitionModel):
     """A predictor network, alone or with a conditioner network.
@@ -115,38 +67,52 @@ class NeuralTransitionModel(BaseTransitionModel):
         if self._body is not None:
             self.predictor = self._body(self.codec, generator)
         else:
-            self.predictor = DensePredictor(
-                self.codec, config.hidden, config.activation, config.residual, generator=generator
-            )
+            shape = (config.hidden, config.activation, config.residual, config.dropout)
+            self.predictor = DensePredictor(self.codec, *shape, generator=generator)
         self.conditioner: Conditioner | None = None
         if config.conditioner is not None:
-            self.conditioner = Conditioner(
-                self.codec,
-                config.conditioner,
-                config.group_size,
-                config.activation,
-                config.correction,
-                generator=generator,
-            )
+            self.conditioner = self._new_conditioner(None, generator)
         self._online: torch.optim.Optimizer | None = None
         self._changed()
 
+    def _new_conditioner(self, grouped: torch.Tensor | None, generator: torch.Generator) -> Conditioner:
+        config = self.config
+        assert config.conditioner is not None
+        return Conditioner(
+            self.codec,
+            config.conditioner,
+            config.group_size,
+            config.activation,
+            config.correction,
+            config.dropout,
+            grouped,
+            generator=generator,
+        )
+
     def _changed(self) -> None:
-        self._dense: DenseWeights | None = None
+        self._forward: CompiledBody | None = None
         self._groups: GroupWeights | None = None
 
     def fit(
         self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None
     ) -> FitReport:
-        """See TransitionModel; fits anew from first weights that depend on ``seed`` only."""
+        """See TransitionModel; fits anew from first weights that depend on ``seed`` only.
+
+        The predictor is fitted first; then the conditioner, with groups for those factors that the predictor leaves open.
+        """
         began = time.perf_counter()
         self._build(seed)
         train_rows, held_out_rows = data.split(self.config.training.validation, seed)
-        held_out = examples(held_out_rows)
-        trainer = Trainer(self.codec, self.predictor, self.conditioner, self.config.training)
+        train, held_out = examples(train_rows), examples(held_out_rows)
         generator = torch.Generator().manual_seed(seed + 1)
-        train = examples(train_rows)
-        epochs = trainer.fit(train, held_out, generator, progress)
+        trainer = Trainer(self.codec, self.predictor, None, self.config.training)
+        half = progress if progress is None or self.conditioner is None else lambda share: progress(0.5 * share)
+        epochs = trainer.fit(train, held_out, generator, half)
+        if self.conditioner is not None:
+            grouped = trainer.open_factors(held_out)
+            self.conditioner = trainer.conditioner = self._new_conditioner(grouped, generator)
+            half = None if progress is None else lambda share: progress(0.5 + 0.5 * share)
+            epochs += trainer.fit_conditioner(train, held_out, generator, half)
         self._changed()
         first, second = trainer.evaluate(held_out)
         return FitReport(
@@ -157,10 +123,13 @@ class NeuralTransitionModel(BaseTransitionModel):
             predictor_loss=first,
             conditioner_loss=second,
             exact_match=self._exact_match(held_out),
-            log={"distinct_transitions": float(len(train))},
+            log={
+                "distinct_transitions": float(len(train)),
+                "conditioned_factors": float(len(self.conditioner.members)) if self.conditioner else 0.0,
+            },
         )
 
-    def _exact_match(self, rows: Any) -> float:
+    def _exact_match(self, rows: Examples) -> float:
         """Weighted share of transitions whose likeliest outcome, factor after factor, is the one met."""
         states, actions, outcomes = rows.states.numpy(), rows.actions.numpy(), rows.outcomes.numpy()
         logits, probs = self._predict(states, actions)
@@ -180,9 +149,9 @@ class NeuralTransitionModel(BaseTransitionModel):
         """
         trainer = Trainer(self.codec, self.predictor, self.conditioner, self.config.training)
         if self._online is None:
-            parameters = [p for module in trainer.modules for p in module.parameters()]
+            parameters = [p for module in self._parts().values() for p in module.parameters()]
             self._online = torch.optim.Adam(parameters, lr=self.config.training.online_learning_rate)
-        trainer.step(self._online, as_examples(states, actions, next_states, terminated))
+        trainer.observe(self._online, as_examples(states, actions, next_states, terminated))
         self._changed()
 
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
@@ -273,18 +242,31 @@ class NeuralTransitionModel(BaseTransitionModel):
         Raises:
             ValueError: the arrays are not those of a model of this shape; nothing is changed then.
         """
-        own = self.state_dict()
-        wrong = sorted(set(own) ^ set(state)) or sorted(n for n in own if own[n].shape != np.shape(state[n]))
+        wrong = self._misfit(state)
         if wrong:
             raise ValueError(
                 f"These weights do not fit this model (first difference: {wrong[0]!r}); "
                 "build the model with the configuration that the weights were saved from."
             )
+        if self.conditioner is not None:
+            grouped = torch.from_numpy(np.array(state["conditioner.grouped"], dtype=np.bool_))
+            self.conditioner = self._new_conditioner(grouped, torch.Generator())
         for part, module in self._parts().items():
             names = module.state_dict()
             module.load_state_dict({n: torch.from_numpy(np.array(state[f"{part}.{n}"])) for n in names})
         self._online = None
         self._changed()
+
+    def _misfit(self, state: Mapping[str, NDArray[Any]]) -> list[str]:
+        """Names of arrays that are missing, unknown, or of the wrong shape (the conditioner's first axis is free)."""
+        own = self.state_dict()
+        wrong = sorted(set(own) ^ set(state))
+        for name in own if not wrong else ():
+            shape, given = own[name].shape, np.shape(state[name])
+            free = name.startswith("conditioner.") and name != "conditioner.grouped"
+            if shape[free:] != given[free:] or len(shape) != len(given):
+                wrong.append(name)
+        return wrong
 
     def _parts(self) -> dict[str, nn.Module]:
         parts = {"predictor": self.predictor}
@@ -300,27 +282,10 @@ class NeuralTransitionModel(BaseTransitionModel):
 
     def _predict(self, states: States, actions: Actions) -> tuple[Floats32, Floats]:
         """The predictor's logits float32 and probabilities float64, [B, O, K]."""
-        if isinstance(self.predictor, DensePredictor):
-            if self._dense is None:
-                self._dense = pack_dense(self.predictor)
-            logits = dense_logits(states, actions, self._layout, self._dense)
-        else:
-            logits = in_chunks(self.predictor, states, actions)
+        if self._forward is None:
+            self._forward = compiled_body(self.predictor, self._layout)
+        logits = self._forward(states, actions)
         return logits, probabilities(logits, self._layout.outputs)
-
-
-@torch.inference_mode()
-def in_chunks(predictor: nn.Module, states: States, actions: Actions) -> Floats32:
-    """Logits float32 [B, O, K] of a torch body, evaluated ``CHUNK`` rows at a time, the last rows filled up with zeros."""
-    parts = []
-    for start in range(0, max(len(states), 1), CHUNK):
-        rows = slice(start, min(start + CHUNK, len(states)))
-        n = rows.stop - rows.start
-        chunk_states = np.zeros((CHUNK, states.shape[1]), dtype=np.int64)
-        chunk_actions = np.zeros(CHUNK, dtype=np.int64)
-        chunk_states[:n], chunk_actions[:n] = states[rows], actions[rows]
-        parts.append(predictor(torch.from_numpy(chunk_states), torch.from_numpy(chunk_actions)).numpy()[:n])
-    return np.concatenate(parts).astype(np.float32, copy=False)
 
 
 def _rows(states: States, actions: Actions) -> tuple[States, Actions]:

@@ -22,22 +22,14 @@ from mbagent.models.kernels import (
     active_columns,
     conditional,
     finish,
+    largest,
+    trusted,
 )
 
 Keys = NDArray[np.uint64]
 
 _ORDER = np.uint64(1 << 32)
 """Salt of a sweep's random order; its draws use the indices of the factors, which are smaller."""
-
-
-@compiled
-def largest(values: Floats, n: int) -> int:
-    """Index of the largest of the first ``n`` values."""
-    best = 0
-    for k in range(1, n):
-        if values[k] > values[best]:
-            best = k
-    return best
 
 
 @compiled
@@ -77,7 +69,8 @@ def sample_causal(
 ) -> Ints:
     """Ancestral draws int64 [B, O]: y_0, then y_1 given it, and so on; ``greedy`` takes the likeliest each time instead.
 
-    A factor whose likeliest value has at least ``certain`` in the predictor's eyes is drawn from the predictor.
+    A factor whose likeliest value has at least ``certain`` in the predictor's eyes, or that has no group in the conditioner,
+    is drawn from the predictor. This is part of the model: ``log_prob_causal`` follows the same rule, so both stay exact.
     """
     n_outputs = len(layout.outputs)
     factors = np.empty((len(states), n_outputs), dtype=np.int64)
@@ -89,7 +82,7 @@ def sample_causal(
         n_active = active_columns(states[b], actions[b], layout, active)
         for i in range(n_outputs):
             n, values = layout.outputs[i], probs[b, i]
-            if values[largest(values, n)] < certain:
+            if not trusted(i, values, layout, group, certain):
                 conditional(i, logits[b, i], active, n_active, factors[b], layout, group, hidden, row_logits, given)
                 values = given
             factors[b, i] = largest(values, n) if greedy else draw(values, n, uniform_at(keys[b], i))
@@ -117,7 +110,7 @@ def log_prob_causal(
         n_active = active_columns(states[b], actions[b], layout, active)
         for i in range(len(layout.outputs)):
             values = probs[b, i]
-            if values[largest(values, layout.outputs[i])] < certain:
+            if not trusted(i, values, layout, group, certain):
                 conditional(i, logits[b, i], active, n_active, factors[b], layout, group, hidden, row_logits, given)
                 values = given
             value = values[factors[b, i]]
@@ -189,7 +182,7 @@ def sample_sweeps(
     active = np.empty(states.shape[1] + 1, dtype=np.int64)
     order = np.empty(n_outputs, dtype=np.int64)
     guess = np.empty(group.others.shape[1], dtype=np.float32)
-    known = np.empty(group.bias.shape, dtype=np.float32)
+    known = np.empty((n_outputs, group.bias.shape[1]), dtype=np.float32)
     hidden = np.empty(group.bias.shape[1], dtype=np.float32)
     row_logits = np.empty(logits.shape[2], dtype=np.float32)
     given, bits = np.empty(logits.shape[2], dtype=np.float64), np.empty(logits.shape[2], dtype=np.float64)
@@ -198,23 +191,23 @@ def sample_sweeps(
         for i in range(n_outputs):
             values = probs[b, i]
             factors[b, i] = _settle(guess, i, values, uniform_at(keys[b], i), layout, bits)
-            if values[largest(values, layout.outputs[i])] < certain:
+            if not trusted(i, values, layout, group, certain):
                 if real_guess:
                     _show(guess, i, values, layout)
-                known[i] = group.bias[i]
+                known[i] = group.bias[group.group_of[i]]
                 for a in range(n_active):
-                    known[i] += group.inputs[i, active[a]]
+                    known[i] += group.inputs[group.group_of[i], active[a]]
         for sweep in range(sweeps):
             key = derive_one(keys[b], np.uint64(sweep))
             _shuffle(order, derive_one(key, _ORDER))
             for i in order:
                 values = probs[b, i]
-                if values[largest(values, layout.outputs[i])] >= certain:
+                if trusted(i, values, layout, group, certain):
                     continue
                 hidden[:] = known[i]
                 for column in range(len(guess)):
                     if guess[column] != 0.0:
-                        hidden += guess[column] * group.others[i, column]
+                        hidden += guess[column] * group.others[group.group_of[i], column]
                 finish(i, logits[b, i], layout, group, hidden, row_logits, given)
                 factors[b, i] = _settle(guess, i, given, uniform_at(key, i), layout, bits)
     return factors

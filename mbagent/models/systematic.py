@@ -21,8 +21,18 @@ from mbagent_envs.random_keys import derive, derive_one, uniform_at, uniforms
 from numpy.typing import NDArray
 
 from mbagent.models.base import Successors
-from mbagent.models.kernels import Floats, Floats32, GroupWeights, Ints, Layout, active_columns, conditional
-from mbagent.models.samplers import draw, largest
+from mbagent.models.kernels import (
+    Floats,
+    Floats32,
+    GroupWeights,
+    Ints,
+    Layout,
+    active_columns,
+    conditional,
+    largest,
+    trusted,
+)
+from mbagent.models.samplers import draw
 
 NEGLIGIBLE = 0.01
 """Probabilities under this share of the factor's largest count as 0 here: noise of the fit, which planners would exploit."""
@@ -195,13 +205,13 @@ def _causal(
         n_live = _begin(p, n_grid)
         for i in range(n_outputs):
             n = layout.outputs[i]
-            trusted = probs[b, i, largest(probs[b, i], n)] >= certain
-            only = _certain(probs[b, i], n) if trusted else -1
+            trust = trusted(i, probs[b, i], layout, group, certain)
+            only = _certain(probs[b, i], n) if trust else -1
             for q in range(n_live):
                 if only >= 0:
                     p.factors[q, i] = only
                     continue
-                if trusted:
+                if trust:
                     values[:] = probs[b, i]
                 else:
                     conditional(i, logits[b, i], active, n_active, p.factors[q], layout, group, hidden, row_logits, values)

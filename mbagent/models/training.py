@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -14,10 +15,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mbagent.models.base import hash_rows
-from mbagent.models.networks import Conditioner, FactorCodec
+from mbagent.models.networks import Conditioner, Dropout, FactorCodec
 from mbagent.transitions import TransitionBatch
 
 Loss: TypeAlias = Literal["cross_entropy", "squared"]
+Progress: TypeAlias = Callable[[float], None]
+RowLosses: TypeAlias = "Callable[[Examples, Loss], Tensor]"
+"""(examples, kind of loss) -> loss of each row and factor [B, O]."""
 
 
 @dataclass(frozen=True)
@@ -35,19 +39,22 @@ class TrainingConfig:
         checks: how often the held-out loss is looked at; the best weights seen are kept.
         patience: stop after this many checks without a better held-out loss.
         loss: "cross_entropy", or "squared" as in the paper.
+        negligible: a factor whose held-out cross-entropy under the predictor is below this many nats gets no group in the
+            conditioner.
         online_learning_rate: Adam's, in the on-line method.
     """
 
     learning_rate: float = 0.01
-    weight_decay: float = 1e-3
+    weight_decay: float = 0.01
     batch_size: int = 256
     epochs: float = 30.0
-    min_steps: int = 2000
+    min_steps: int = 1500
     max_steps: int = 6000
     validation: float = 0.1
     checks: int = 40
     patience: int = 12
     loss: Loss = "cross_entropy"
+    negligible: float = 1e-3
     online_learning_rate: float = 3e-3
 
 
@@ -103,24 +110,25 @@ def as_examples(
 
 
 def losses(codec: FactorCodec, logits: Tensor, outcomes: Tensor, loss: Loss) -> Tensor:
-    """Loss of each row [B], summed over factors, of logits [B, O, K] on outcomes int64 [B, O].
+    """Loss of each row and factor [B, O] of logits [B, O, K] on outcomes int64 [B, O].
 
     Cross-entropy is in nats; squared error is summed over values.
     """
     if loss == "squared":
         wanted = functional.one_hot(outcomes, codec.width)
-        return ((torch.softmax(logits, dim=2) - wanted) ** 2).sum(dim=(1, 2))
+        return ((torch.softmax(logits, dim=2) - wanted) ** 2).sum(dim=2)
     if codec.all_binary:
         margin = logits[:, :, 1] - logits[:, :, 0]
-        return functional.binary_cross_entropy_with_logits(margin, outcomes.to(margin.dtype), reduction="none").sum(1)
+        return functional.binary_cross_entropy_with_logits(margin, outcomes.to(margin.dtype), reduction="none")
     flat = functional.cross_entropy(logits.flatten(0, 1), outcomes.flatten(), reduction="none")
-    return flat.view(outcomes.shape).sum(dim=1)
+    return flat.view(outcomes.shape)
 
 
 class Trainer:
-    """Gradient steps on a predictor and, at the same time, its conditioner.
+    """Fits a predictor and then a conditioner to examples, or both to one observation after another.
 
-    The two losses are added; the conditioner gets the predictor's logits detached, so neither disturbs the other.
+    The conditioner's loss never reaches the predictor, so the order does not matter to the predictor; a conditioner that
+    corrects a finished predictor has a fixed thing to correct.
 
     Args:
         codec: the factors.
@@ -136,81 +144,132 @@ class Trainer:
         self.predictor = predictor
         self.conditioner = conditioner
         self.config = config
-        self.modules = [m for m in (predictor, conditioner) if m is not None]
 
-    def row_losses(self, batch: Examples, loss: Loss) -> tuple[Tensor, Tensor | None]:
-        """Loss of the predictor and of the conditioner, [B] each."""
-        logits = self.predictor(batch.states, batch.actions)
-        first = losses(self.codec, logits, batch.outcomes, loss)
-        if self.conditioner is None:
-            return first, None
-        given = self.conditioner(batch.states, batch.actions, batch.outcomes)
+    def predictor_losses(self, batch: Examples, loss: Loss) -> Tensor:
+        """The predictor's loss [B, O]."""
+        return losses(self.codec, self.predictor(batch.states, batch.actions), batch.outcomes, loss)
+
+    def conditioner_losses(self, batch: Examples, loss: Loss) -> Tensor:
+        """The conditioner's loss [B, O], given the true other variables."""
+        assert self.conditioner is not None
+        logits = self.conditioner(batch.states, batch.actions, batch.outcomes)
         if self.conditioner.correction:
-            given = given + logits.detach()
-        return first, losses(self.codec, given, batch.outcomes, loss)
-
-    def step(self, optimizer: torch.optim.Optimizer, batch: Examples) -> None:
-        """One gradient step."""
-        first, second = self.row_losses(batch, self.config.loss)
-        total = first if second is None else first + second
-        optimizer.zero_grad(set_to_none=True)
-        (total * batch.weights).mean().backward()  # type: ignore[no-untyped-call]
-        optimizer.step()
-
-    @torch.no_grad()
-    def evaluate(self, rows: Examples) -> tuple[float, float | None]:
-        """Mean cross-entropy in nats a transition of the predictor and of the conditioner (given the true others)."""
-        sums, weight = [0.0, 0.0], 0.0
-        for part in torch.arange(len(rows)).split(4096):
-            batch = rows.select(part)
-            weight += float(batch.weights.sum())
-            for which, values in enumerate(self.row_losses(batch, "cross_entropy")):
-                sums[which] += float((values * batch.weights).sum()) if values is not None else 0.0
-        weight = max(weight, 1e-12)
-        return sums[0] / weight, sums[1] / weight if self.conditioner is not None else None
+            with torch.no_grad():
+                base = self.predictor(batch.states, batch.actions)
+            logits = logits + base
+        return losses(self.codec, logits, batch.outcomes, loss)
 
     def fit(
-        self, train: Examples, held_out: Examples, generator: torch.Generator, progress: Callable[[float], None] | None
+        self, train: Examples, held_out: Examples, generator: torch.Generator, progress: Progress | None
     ) -> float:
-        """AdamW on a one-cycle schedule with early stopping; leaves the best weights in place; returns epochs done."""
+        """Fits the predictor; leaves its best weights in place; returns epochs done."""
+        return self._run(self.predictor, self.predictor_losses, train, held_out, generator, progress)
+
+    def fit_conditioner(
+        self, train: Examples, held_out: Examples, generator: torch.Generator, progress: Progress | None
+    ) -> float:
+        """Fits the conditioner, if any factor needs it; leaves its best weights in place; returns epochs done."""
+        if self.conditioner is None or len(self.conditioner.members) == 0:
+            return 0.0
+        return self._run(self.conditioner, self.conditioner_losses, train, held_out, generator, progress)
+
+    def observe(self, optimizer: torch.optim.Optimizer, batch: Examples) -> None:
+        """One gradient step of both networks at once."""
+        total = self.predictor_losses(batch, self.config.loss).sum(dim=1)
+        if self.conditioner is not None:
+            total = total + self.conditioner_losses(batch, self.config.loss).sum(dim=1)
+        _descend(optimizer, total.mean())
+
+    def open_factors(self, rows: Examples) -> Tensor:
+        """Which factors the predictor leaves open, bool [O]; all False where fewer than two are: nothing depends on another."""
+        nats = self._mean(self.predictor_losses, rows)
+        still_open = nats > self.config.negligible
+        return still_open if int(still_open.sum()) > 1 else torch.zeros_like(still_open)
+
+    def evaluate(self, rows: Examples) -> tuple[float, float | None]:
+        """Mean cross-entropy in nats a transition of the predictor and of the conditioner (given the true others)."""
+        first = float(self._mean(self.predictor_losses, rows).sum())
+        if self.conditioner is None:
+            return first, None
+        return first, float(self._mean(self.conditioner_losses, rows).sum())
+
+    @torch.no_grad()
+    def _mean(self, row_losses: RowLosses, rows: Examples) -> Tensor:
+        """Weighted mean cross-entropy of each factor, float64 [O]."""
+        total, weight = torch.zeros(len(self.codec.outputs), dtype=torch.float64), 1e-12
+        for part in torch.arange(len(rows)).split(4096):
+            batch = rows.select(part)
+            total += (row_losses(batch, "cross_entropy") * batch.weights[:, None]).sum(dim=0)
+            weight += float(batch.weights.sum())
+        return total / weight
+
+    def _run(
+        self,
+        module: nn.Module,
+        row_losses: RowLosses,
+        train: Examples,
+        held_out: Examples,
+        generator: torch.Generator,
+        progress: Progress | None,
+    ) -> float:
+        """AdamW on a one-cycle schedule with early stopping on the held-out loss."""
         config = self.config
-        per_epoch = math.ceil(len(train) / config.batch_size)
-        n_steps = int(min(max(config.epochs * per_epoch, config.min_steps), config.max_steps))
+        per_epoch = max(1, math.ceil(len(train) / config.batch_size))
+        n_steps = int(min(max(config.epochs * per_epoch, config.min_steps), config.max_steps)) if len(train) else 0
         every = max(1, n_steps // config.checks)
-        optimizer = self._adamw()
-        best, best_weights, waited, done = math.inf, self._weights(), 0, 0
+        optimizer = self._adamw(module)
+        best, best_weights, waited, done = math.inf, _weights(module), 0, 0
         for batch in batches(train, config.batch_size, n_steps, generator):
-            self._set_rate(optimizer, config.learning_rate * one_cycle(done / n_steps))
-            self.step(optimizer, batch)
+            _set_rate(optimizer, config.learning_rate * one_cycle(done / n_steps))
+            with noise(module, generator):
+                total = row_losses(batch, config.loss).sum(dim=1)
+            _descend(optimizer, (total * batch.weights).mean())
             done += 1
             if done % every and done < n_steps:
                 continue
-            first, second = self.evaluate(held_out)
-            score = first + (second or 0.0)
+            score = float(self._mean(row_losses, held_out).sum())
             waited += 1
             if score < best:
-                best, best_weights, waited = score, self._weights(), 0
+                best, best_weights, waited = score, _weights(module), 0
             if progress is not None:
                 progress(done / n_steps)
             if waited >= config.patience:
                 break
-        for module, weights in zip(self.modules, best_weights, strict=True):
-            module.load_state_dict(weights)
+        module.load_state_dict(best_weights)
         return done / per_epoch
 
-    def _adamw(self) -> torch.optim.AdamW:
-        parameters = [p for module in self.modules for p in module.parameters()]
-        decayed = {"params": [p for p in parameters if p.ndim > 1], "weight_decay": self.config.weight_decay}
-        free = {"params": [p for p in parameters if p.ndim <= 1], "weight_decay": 0.0}
+    def _adamw(self, module: nn.Module) -> torch.optim.AdamW:
+        decayed = {"params": [p for p in module.parameters() if p.ndim > 1], "weight_decay": self.config.weight_decay}
+        free = {"params": [p for p in module.parameters() if p.ndim <= 1], "weight_decay": 0.0}
         return torch.optim.AdamW([decayed, free], lr=self.config.learning_rate, fused=True)
 
-    @staticmethod
-    def _set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
-        for group in optimizer.param_groups:
-            group["lr"] = rate
 
-    def _weights(self) -> list[dict[str, Tensor]]:
-        return [{k: v.detach().clone() for k, v in module.state_dict().items()} for module in self.modules]
+def _descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()  # type: ignore[no-untyped-call]
+    optimizer.step()
+
+
+def _set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+
+
+def _weights(module: nn.Module) -> dict[str, Tensor]:
+    return {name: value.detach().clone() for name, value in module.state_dict().items()}
+
+
+@contextmanager
+def noise(module: nn.Module, generator: torch.Generator) -> Iterator[None]:
+    """Switches the module's dropout on for a while."""
+    layers = [layer for layer in module.modules() if isinstance(layer, Dropout)]
+    for layer in layers:
+        layer.generator = generator
+    try:
+        yield
+    finally:
+        for layer in layers:
+            layer.generator = None
 
 
 def batches(rows: Examples, size: int, n_steps: int, generator: torch.Generator) -> Iterator[Examples]:

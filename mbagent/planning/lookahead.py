@@ -38,7 +38,7 @@ def grow_lookahead(
     for depth in range(horizon):
         groups = graph.groups[layer]
         sizes = np.bincount(groups, minlength=len(roots))
-        place = _place_in_group(groups)
+        place = place_in_group(groups)
         keep = place < budget[groups]
         layer, groups = layer[keep], groups[keep]
         if len(layer) == 0:
@@ -59,7 +59,7 @@ def _draws(sizes: NDArray[np.int64], n_samples: int) -> NDArray[np.int64]:
     return np.where(wanted >= n_samples, n_samples, np.minimum(powers, n_samples))
 
 
-def _place_in_group(groups: NDArray[np.int64]) -> NDArray[np.int64]:
+def place_in_group(groups: NDArray[np.int64]) -> NDArray[np.int64]:
     """Running number of each entry within its group."""
     order = np.argsort(groups, kind="stable")
     ordered = groups[order]

@@ -7,11 +7,18 @@ from mbagent_envs.random_keys import derive
 
 from mbagent.models.base import Floats, States
 from mbagent.models.state_graph import StateGraph
+from mbagent.planning.lookahead import place_in_group
 from mbagent.planning.machine_planner import MachinePlanner
 from mbagent.planning.planner import Plan, best_actions
 from mbagent.planning.rollouts import random_returns
 from mbagent.planning.tree import Ints, Paths, back_up_max, back_up_mean, empty_paths, initialise, select
-from mbagent.planning.value_iteration import Values, score_edges
+from mbagent.planning.value_iteration import Values, score_edges, settle
+
+FINAL_SWEEPS = 100
+"""Sweeps of value iteration, at most, that settle the grown graph after the last simulation."""
+
+WIDENING_SWEEPS = 3
+"""The same after a wave that widened the graph."""
 
 LEAF_SAMPLES = 4
 """Draws for each (state, action) of a node that the search adds."""
@@ -33,7 +40,11 @@ class MctsPlanner(MachinePlanner):
             return super().plan(roots)
         graph = StateGraph(self._known_model())
         nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
-        values, visits, scores = self._search(graph, _nothing(graph, len(roots)), nodes, shared=False)
+        graph.expand(nodes, self.settings.n_samples, self.settings.seed)
+        nothing = np.zeros((len(graph), graph.model.n_actions))
+        rewards = score_edges(graph, self._known_goal())
+        solution = Values(nothing[:, 0].copy(), nothing, rewards, np.zeros(len(roots)))
+        values, visits, scores = self._search(graph, solution, nodes, shared=False)
         return Plan(best_actions(scores), values, visits)
 
     def _search(
@@ -55,9 +66,11 @@ class _Search:
         self.settings = planner.settings
         self.rollouts = self.settings.leaf_values == "rollouts"
         self.prior = 0.0 if self.rollouts else self.settings.prior_visits
-        self.q, self.v, self.rewards = solution.q.copy(), solution.v.copy(), solution.rewards
-        self.frontier = solution.frontier
-        self.visits, self.counted = np.zeros_like(self.q), np.zeros_like(self.q)
+        self.solution = Values(
+            solution.v.copy(), solution.q.copy(), solution.rewards, solution.frontier.copy()
+        )
+        self.root_visits = np.zeros((len(roots), graph.model.n_actions))
+        self.visits, self.counted = np.zeros_like(solution.q), np.zeros_like(solution.q)
         spread = solution.v[roots]
         self.extremes = np.stack([spread, spread], axis=1)
         self.spans = _spans(graph, solution, roots)
@@ -71,9 +84,20 @@ class _Search:
             self._select(paths, done)
             self._expand(paths, done)
             self._back_up(paths, done)
+            self._count(paths)
+            if not self.rollouts:
+                self.spans = _spans(self.graph, self.solution, self.roots)
             done += wave
-        values, visits = self.q[self.roots], self.visits[self.roots]
+        if self.settings.backup == "max":
+            settle(self.graph, self.solution, self.settings.gamma, FINAL_SWEEPS)
+        values, visits = self.solution.q[self.roots], self.root_visits
         return values, visits, (visits + 1e-6 * _unit(values) if self.settings.backup == "mean" else values)
+
+    def _count(self, paths: Paths) -> None:
+        """First actions of the wave's simulations; a root met again further down does not count."""
+        rows = np.repeat(np.arange(len(self.roots)), paths.lengths.shape[1])
+        moved = paths.lengths.ravel() > 0
+        np.add.at(self.root_visits, (rows[moved], self.graph.actions[paths.edges[:, :, 0].ravel()[moved]]), 1.0)
 
     def _select(self, paths: Paths, done: int) -> None:
         graph, settings = self.graph, self.settings
@@ -85,7 +109,7 @@ class _Search:
             graph.next_nodes,
             graph.probabilities,
             graph.terminated,
-            self.q,
+            self.solution.q,
             self.visits,
             self.spans,
             self.prior,
@@ -100,19 +124,40 @@ class _Search:
 
     def _expand(self, paths: Paths, done: int) -> None:
         """Adds the wave's leaves to the graph: one call of the model, one of the goal."""
-        graph, leaves = self.graph, np.unique(paths.leaves[paths.leaves >= 0])
+        graph, solution = self.graph, self.solution
+        leaves = np.unique(paths.leaves[paths.leaves >= 0])
+        widened = np.zeros(0, dtype=np.int64) if self.rollouts else self._widen(paths)
+        leaves = np.union1d(leaves, widened)
         if len(leaves) == 0:
             return
         n_edges = graph.n_edges
         draws = self.settings.n_samples if self.rollouts else LEAF_SAMPLES
         fresh = graph.expand(leaves, draws, int(derive(self.settings.seed, _SEARCH_SALT, done + 1)[0]))
-        self.rewards = np.concatenate([self.rewards, score_edges(graph, self.planner._known_goal(), n_edges)])
-        n_actions = self.q.shape[1]
-        room = np.zeros((len(fresh), n_actions))
-        self.q, self.visits, self.counted = (np.concatenate([x, room]) for x in (self.q, self.visits, self.counted))
-        self.v = np.concatenate([self.v, self.frontier[graph.groups[fresh]]])
-        if not self.rollouts:
-            self._bellman(leaves)
+        solution.rewards = np.concatenate([solution.rewards, score_edges(graph, self.planner._known_goal(), n_edges)])
+        room = np.zeros((len(fresh), graph.model.n_actions))
+        solution.q, self.visits, self.counted = (
+            np.concatenate([x, room]) for x in (solution.q, self.visits, self.counted)
+        )
+        solution.v = np.concatenate([solution.v, solution.frontier[graph.groups[fresh]]])
+        if self.rollouts:
+            return
+        self._bellman(leaves)
+        if len(widened):  # no path leads there yet that a backup would follow
+            only = np.isin(np.arange(len(solution.frontier)), graph.groups[widened])
+            settle(graph, solution, self.settings.gamma, WIDENING_SWEEPS, only)
+
+    def _widen(self, paths: Paths) -> Ints:
+        """For every simulation that only went round in known states: the state that has waited longest, instead."""
+        idle = ((paths.leaves < 0) & (paths.ends >= 0)).sum(axis=1)
+        graph = self.graph
+        if not idle.any() or graph.expanded.all():
+            return np.zeros(0, dtype=np.int64)
+        waiting = np.flatnonzero(~graph.expanded)
+        waiting = waiting[~graph.only_terminal(waiting)]
+        allowance = np.zeros(graph.groups.max() + 1, dtype=np.int64)
+        allowance[graph.groups[self.roots]] = idle
+        groups = graph.groups[waiting]
+        return waiting[place_in_group(groups) < allowance[groups]]
 
     def _bellman(self, nodes: Ints) -> None:
         graph = self.graph
@@ -123,10 +168,10 @@ class _Search:
             graph.next_nodes,
             graph.probabilities,
             graph.terminated,
-            self.rewards,
+            self.solution.rewards,
             self.settings.gamma,
-            self.v,
-            self.q,
+            self.solution.v,
+            self.solution.q,
         )
 
     def _back_up(self, paths: Paths, done: int) -> None:
@@ -139,25 +184,25 @@ class _Search:
                 graph.next_nodes,
                 graph.probabilities,
                 graph.terminated,
-                self.rewards,
+                self.solution.rewards,
                 gamma,
                 paths.edges,
                 paths.lengths,
-                self.v,
-                self.q,
+                self.solution.v,
+                self.solution.q,
             )
             return
         back_up_mean(
             graph.sources,
             graph.actions,
-            self.rewards,
+            self.solution.rewards,
             gamma,
             self.prior,
             paths.edges,
             paths.lengths,
             self._end_values(paths, done),
             self.counted,
-            self.q,
+            self.solution.q,
             self.spans,
             self.extremes,
         )
@@ -167,7 +212,7 @@ class _Search:
         values = np.zeros(paths.ends.shape)
         alive = paths.ends >= 0
         if not self.rollouts:
-            values[alive] = self.v[paths.ends[alive]]
+            values[alive] = self.solution.v[paths.ends[alive]]
             return values
         settings = self.settings
         simulation = np.broadcast_to(done + np.arange(paths.ends.shape[1]), paths.ends.shape)[alive]
@@ -197,9 +242,3 @@ def _unit(values: Floats) -> Floats:
     low, high = values.min(axis=1, keepdims=True), values.max(axis=1, keepdims=True)
     unit: Floats = (values - low) / np.maximum(high - low, 1e-12)
     return unit
-
-
-def _nothing(graph: StateGraph, n_groups: int) -> Values:
-    """Values of a graph of which nothing is known yet."""
-    nothing = np.zeros((len(graph), graph.model.n_actions))
-    return Values(np.zeros(len(graph)), nothing, np.zeros(0), nothing, np.zeros(n_groups))

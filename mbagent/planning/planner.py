@@ -21,7 +21,8 @@ class PlannerSettings:
         horizon: steps a simulation looks ahead, at most.
         max_states: reachable states up to which the whole machine is solved once, for all decisions.
         lookahead_states: states imagined around each root where the whole machine is larger than that.
-        n_samples: draws for a (state, action) whose successors are too many to enumerate.
+        n_samples: draws for a (state, action) whose successors are too many to enumerate, in the whole machine.
+        lookahead_samples: the same near a root, where the whole machine is too large.
         leaf_values: "machine" (values of the reachable machine) or "rollouts" (random play).
         backup: "max" (an action is worth what the best behaviour after it is worth) or "mean" (plain UCT).
         choice: "mean", or "greatest" as in the paper (flat Monte Carlo only; it seeks risk).
@@ -38,8 +39,9 @@ class PlannerSettings:
     gamma: float = 0.99
     horizon: int = 20
     max_states: int = 3000
-    lookahead_states: int = 384
+    lookahead_states: int = 160
     n_samples: int = 16
+    lookahead_samples: int = 4
     leaf_values: Literal["machine", "rollouts"] = "machine"
     backup: Literal["max", "mean"] = "max"
     choice: Literal["mean", "greatest"] = "mean"
@@ -50,7 +52,7 @@ class PlannerSettings:
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
-        for name in ("num_simulations", "horizon", "max_states", "lookahead_states", "n_samples", "wave"):
+        for name in ("num_simulations", "horizon", "max_states", "lookahead_states", "n_samples", "lookahead_samples", "wave"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")

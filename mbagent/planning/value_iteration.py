@@ -8,7 +8,7 @@ import numpy as np
 from mbagent_envs._compiled import compiled
 from numpy.typing import NDArray
 
-from mbagent.models.base import Floats, States, TransitionModel
+from mbagent.models.base import Bools, Floats, States, TransitionModel
 from mbagent.models.reachable import grow_reachable
 from mbagent.models.state_graph import StateGraph
 from mbagent.planning.goal import Goal
@@ -27,14 +27,12 @@ class Values:
         v: float64 [N], value of each state with the best action; of unexpanded ones the frontier's value.
         q: float64 [N, A], value of each action; zero rows for unexpanded states.
         rewards: float64 [M], reward of every successor edge.
-        mean_rewards: float64 [N, A], expected reward of each action.
         frontier: float64 [G], value of unexpanded states in each group.
     """
 
     v: Floats
     q: Floats
     rewards: Floats
-    mean_rewards: Floats
     frontier: Floats
 
 
@@ -47,7 +45,7 @@ def score_edges(graph: StateGraph, goal: Goal, start: int = 0) -> Floats:
 
 
 def solve(graph: StateGraph, goal: Goal, gamma: float, n_groups: int = 1) -> Values:
-    """Value iteration in place (Gauss-Seidel, last node first: one sweep settles a graph without cycles).
+    """Value iteration from scratch.
 
     States that were never expanded are worth the mean of their group's expanded states, found together with the
     values: zero would make every cost end, and every income stop, at the edge of what was imagined.
@@ -58,26 +56,42 @@ def solve(graph: StateGraph, goal: Goal, gamma: float, n_groups: int = 1) -> Val
         gamma: discount, below one.
         n_groups: groups of the graph are numbered 0 ... n_groups - 1.
     """
-    rewards = score_edges(graph, goal)
-    n, n_actions = len(graph), graph.model.n_actions
-    flat = graph.sources * n_actions + graph.actions
-    mean_rewards = np.bincount(flat, weights=rewards * graph.probabilities, minlength=n * n_actions)
-    mean_rewards = mean_rewards.reshape(n, n_actions)
-    weights = graph.probabilities * ~graph.terminated
-    v, q, frontier = _sweep(
+    nothing = np.zeros((len(graph), graph.model.n_actions))
+    values = Values(nothing[:, 0].copy(), nothing, score_edges(graph, goal), np.zeros(n_groups))
+    settle(graph, values, gamma)
+    return values
+
+
+def settle(
+    graph: StateGraph, values: Values, gamma: float, max_sweeps: int = MAX_SWEEPS, only: Bools | None = None
+) -> None:
+    """Value iteration from the given values on, in place (Gauss-Seidel, last node first: without cycles one sweep does).
+
+    Args:
+        graph: what was imagined.
+        values: where to start; updated.
+        gamma: discount.
+        max_sweeps: sweeps, at most.
+        only: bool [G], the groups to work on; None for all.
+    """
+    flat = graph.sources * graph.model.n_actions + graph.actions
+    mean_rewards = np.bincount(flat, weights=values.rewards * graph.probabilities, minlength=values.q.size)
+    _sweep(
         graph.groups,
         graph.expanded,
         graph.first,
         graph.count,
         graph.next_nodes,
-        weights,
-        mean_rewards,
-        n_groups,
+        graph.probabilities * ~graph.terminated,
+        mean_rewards.reshape(values.q.shape),
         gamma,
         TOLERANCE,
-        MAX_SWEEPS,
+        max_sweeps,
+        np.ones(len(values.frontier), dtype=np.bool_) if only is None else only.copy(),
+        values.v,
+        values.q,
+        values.frontier,
     )
-    return Values(v, q, rewards, mean_rewards, frontier)
 
 
 @compiled
@@ -89,16 +103,20 @@ def _sweep(
     next_nodes: NDArray[np.int64],
     weights: NDArray[np.float64],
     mean_rewards: NDArray[np.float64],
-    n_groups: int,
     gamma: float,
     tolerance: float,
     max_sweeps: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    active: NDArray[np.bool_],
+    v: NDArray[np.float64],
+    q: NDArray[np.float64],
+    frontier: NDArray[np.float64],
+) -> None:
+    """Sweeps over the ``active`` groups (overwritten); updates the last three arguments (see Values)."""
     n, n_actions = first.shape
-    v, q = np.zeros(n), np.zeros((n, n_actions))
-    frontier, sums, sizes = np.zeros(n_groups), np.zeros(n_groups), np.zeros(n_groups)
+    n_groups = len(frontier)
+    sums, sizes = np.zeros(n_groups), np.zeros(n_groups)
     # Every group stops by its own measure: its values must not depend on what else is solved in the same call.
-    moved, scale, active = np.zeros(n_groups), np.full(n_groups, 1e-12), np.ones(n_groups, dtype=np.bool_)
+    moved, scale = np.zeros(n_groups), np.full(n_groups, 1e-12)
     for s in range(n):
         sizes[groups[s]] += expanded[s]
         scale[groups[s]] = max(scale[groups[s]], np.abs(mean_rewards[s]).max())
@@ -131,7 +149,6 @@ def _sweep(
             active[g] = active[g] and moved[g] > tolerance * scale[g]
         if not active.any():
             break
-    return v, q, frontier
 
 
 class Machine:

@@ -47,6 +47,9 @@ class FakeAgent:
         self.num_timesteps = total_timesteps
         return self
 
+    def set_env(self, env: Any) -> None:
+        assert not hasattr(env.unwrapped, "reward_fn")
+
     def set_reward(self, reward: Any) -> None:
         self.goals.append(reward)
 
@@ -69,6 +72,7 @@ TINY = Settings(
     steps=1000,
     seeds=2,
     episodes=3,
+    goal_episodes=2,
     curve_steps=(500,),
     goal_seeds=2,
     scale_episodes=60,
@@ -87,15 +91,15 @@ def test_the_plan_holds_every_agent_of_every_case_and_no_file_twice() -> None:
         assert len(set(names)) == len(names)
         for case in settings.cases:
             agents = {job.agent for job in plan if job.case == case}
-            assert {"PPO", "DQN", "A2C", RANDOM, LEARNED_REWARD} <= agents
-            assert case == "frozen_lake" or {AGENT, TRUE_MODEL} <= agents
+            assert {"PPO", "DQN", "A2C", RANDOM} <= agents
+            assert agents >= ({LEARNED_REWARD} if case == "frozen_lake" else {AGENT, TRUE_MODEL})
 
 
 def test_full_trains_longer_baselines_and_at_least_five_seeds_with_a_hundred_episodes() -> None:
     ppo = [job for job in plan_jobs(FULL) if job.agent == "PPO" and job.case == "maneuverer"]
     assert sorted({job.steps for job in ppo}) == [50_000, 500_000]
     assert len({job.seed for job in ppo}) >= 5
-    assert QUICK.seeds * QUICK.episodes >= 100
+    assert FULL.seeds * FULL.episodes >= 100
 
 
 @pytest.mark.usefixtures("fake_agent")
@@ -109,7 +113,7 @@ def test_a_whole_comparison_becomes_one_page_and_one_table(tmp_path: Path) -> No
     assert set(rows) == {AGENT, LEARNED_REWARD, TRUE_MODEL, "PPO", "DQN", "A2C", RANDOM}
     assert rows["PPO"].steps == rows[AGENT].steps == 1000
     assert rows[AGENT].seeds == 2
-    assert rows[AGENT].episodes == 6
+    assert rows[AGENT].episodes == 2 * 3 * 5
     assert abs(rows[RANDOM].score.estimate) < 0.3
     assert all(row.weights_unchanged for row in results[0].goals)
     assert len(results[0].goals) >= 3

@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+
+from mbagent.models.reachable import grow_reachable
+from mbagent.models.state_graph import StateGraph
+from mbagent.planning.machine_planner import MachinePlanner
+from mbagent.planning.planner import PlannerSettings
+from mbagent.planning.value_iteration import solve
+from tests.worlds import TableWorld, arrival_goal, optimal_q, random_table
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_values_of_a_complete_machine_are_exact(seed: int) -> None:
+    table, rewards = random_table(12, 3, seed), np.random.default_rng(seed).normal(size=12)
+    world = TableWorld(table, ends=(11,))
+    graph, complete = grow_reachable(world, np.array([[0]]), max_states=100, n_samples=4)
+    values = solve(graph, arrival_goal(rewards), gamma=0.95)
+    exact = optimal_q(table, rewards, 0.95, ends=(11,))
+    assert complete
+    inside = graph.expanded
+    np.testing.assert_allclose(values.q[inside], exact[graph.states[inside, 0]], atol=1e-5)
+
+
+def test_terminal_states_are_not_looked_beyond() -> None:
+    table = np.zeros((3, 1, 3))
+    table[0, 0, 1] = table[1, 0, 2] = table[2, 0, 2] = 1.0
+    graph, complete = grow_reachable(TableWorld(table, ends=(1,)), np.array([[0]]), 10, 4)
+    assert complete
+    assert sorted(graph.states[:, 0]) == [0, 1]
+    values = solve(graph, arrival_goal(np.array([0.0, 1.0, 100.0])), gamma=0.9)
+    assert values.q[0, 0] == pytest.approx(1.0)
+
+
+def test_an_endless_cost_does_not_end_at_the_edge_of_what_was_imagined() -> None:
+    n = 50
+    table = np.zeros((n, 2, n))
+    for s in range(n):
+        table[s, 0, s] = 1.0  # stay
+        table[s, 1, min(s + 1, n - 1)] = 1.0  # towards the edge
+    graph = StateGraph(TableWorld(table))
+    graph.add(np.array([[0]]), np.zeros(1, dtype=np.int64))
+    for _ in range(10):
+        graph.expand(np.flatnonzero(~graph.expanded), 1, 0)
+    values = solve(graph, arrival_goal(np.full(n, -1.0)), gamma=0.99)
+    # Every behaviour costs 1 a step for ever: nothing is gained by running to where nothing was imagined.
+    np.testing.assert_allclose(values.v, -100.0, rtol=1e-3)
+
+
+def test_groups_are_solved_alike_alone_and_together() -> None:
+    table, rewards = random_table(30, 2, 3), np.random.default_rng(3).normal(size=30) * 10
+    world, goal = TableWorld(table), arrival_goal(rewards)
+    settings = PlannerSettings(max_states=1, lookahead_states=12, horizon=6)
+    planner = MachinePlanner(settings)
+    planner.set_model(world, np.array([[0]]))
+    planner.set_goal(goal)
+    roots = np.arange(8)[:, None]
+    together = planner.plan(roots)
+    for i in range(8):
+        alone = planner.plan(roots[i : i + 1])
+        np.testing.assert_array_equal(alone.values[0], together.values[i])
+        assert alone.actions[0] == together.actions[i]
+
+
+def test_start_states_beyond_the_budget_give_no_machine_but_a_plan() -> None:
+    world = TableWorld(random_table(40, 2, 1))
+    planner = MachinePlanner(PlannerSettings(max_states=5))
+    planner.set_model(world, np.array([[0]]))
+    planner.set_goal(arrival_goal(np.arange(40.0)))
+    assert planner.plan(np.array([[0], [7]])).values.shape == (2, 2)
