@@ -32,7 +32,8 @@ def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
     if isinstance(space, spaces.MultiDiscrete):
         return {"type": "MultiDiscrete", "nvec": space.nvec.tolist(), "start": space.start.tolist(), "dtype": str(space.dtype)}
     if isinstance(space, spaces.MultiBinary):
-        return {"type": "MultiBinary", "shape": list(space.shape)}
+        n = space.n
+        return {"type": "MultiBinary", "n": int(n) if isinstance(n, int | np.integer) else [int(k) for k in n]}
     if isinstance(space, spaces.Box):
         return {"type": "Box", "low": space.low.tolist(), "high": space.high.tolist(), "dtype": str(space.dtype)}
     if isinstance(space, spaces.Dict):
@@ -54,8 +55,7 @@ def space_from_json(data: Mapping[str, Any]) -> spaces.Space[Any]:
     if kind == "MultiDiscrete":
         return spaces.MultiDiscrete(np.array(data["nvec"]), start=np.array(data["start"]), dtype=np.dtype(data["dtype"]).type)
     if kind == "MultiBinary":
-        shape = data["shape"]
-        return spaces.MultiBinary(shape if len(shape) > 1 else shape[0])
+        return spaces.MultiBinary(data["n"] if isinstance(data["n"], int) else tuple(data["n"]))
     if kind == "Box":
         dtype = np.dtype(data["dtype"])
         return spaces.Box(np.array(data["low"], dtype=dtype), np.array(data["high"], dtype=dtype), dtype=dtype.type)

@@ -136,6 +136,12 @@ def run(
 
 
 def load(folder: Path) -> list[Record]:
-    """The records kept by an earlier ``run``."""
-    files = sorted((folder / "records").glob("*.json"))
-    return [record for file in files if file.name != "settings.json" for record in read_records(file)]
+    """The records kept by an earlier ``run``.
+
+    Raises:
+        ValueError: there are none.
+    """
+    files = [file for file in sorted((folder / "records").glob("*.json")) if file.name != "settings.json"]
+    if not files:
+        raise ValueError(f"There are no records in {folder / 'records'}; run the comparison first.")
+    return [record for file in files for record in read_records(file)]

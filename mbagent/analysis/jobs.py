@@ -169,6 +169,8 @@ def _plan_on_true_model(job: Job, case: Case, report: Report | None) -> list[Rec
     if game is None:
         return []
     agent = ModelLearningAgent("MctsPolicy", case.make_env(), model=SimulatorModel(game), seed=job.seed)
+    if not agent.policy.fitted:
+        agent.learn(total_timesteps=1000)  # nothing is fitted: it only meets start states to plan from
     return _score_goals(job, case, agent, 0.0, report)
 
 
@@ -241,7 +243,7 @@ def _score_goals(
                 job,
                 goal,
                 played.returns[goal],
-                steps=agent.num_timesteps,
+                steps=agent.num_timesteps if learned else 0,
                 learn_seconds=seconds,
                 decision_ms=decision_ms if goal == "default" else float("nan"),
                 weights_before=before,

@@ -155,9 +155,8 @@ def _shown(board: _Board, console: Console) -> Iterator[None]:
     def beat() -> None:
         while not stop.wait(_HEARTBEAT_SECONDS):
             now = "; ".join(f"{name} {share:.0%}" for share, name in board.running())
-            console.print(
-                f"... {board.elapsed}, {board.done} of {board.total} jobs done; {now}", highlight=False
-            )
+            line = f"... {board.elapsed}, {board.done} of {board.total} jobs done; {now}"
+            console.print(line, highlight=False, soft_wrap=True)
 
     thread = threading.Thread(target=beat, daemon=True)
     thread.start()

@@ -22,6 +22,8 @@ class NeuralConfig:
         correction: whether the conditioner's output is added to the predictor's logits.
         certain: a factor whose likeliest value has this probability in the predictor's eyes is left to the predictor.
         dropout: share of hidden nodes zeroed in each training step; without it, networks learn the noise of rare states.
+            None: 0.4, or 0 where the state is a single factor: what states have in common is not in their columns then, the
+            network is a table, and dropout only blurs it.
         sweeps: passes over all factors, mask "others".
         real_guess: whether the first guess is the predictor's probabilities rather than bits drawn from them.
         training: see TrainingConfig.
@@ -34,10 +36,16 @@ class NeuralConfig:
     group_size: int = 16
     correction: bool = True
     certain: float = 0.999
-    dropout: float = 0.4
+    dropout: float | None = None
     sweeps: int = 5
     real_guess: bool = False
     training: TrainingConfig = field(default_factory=TrainingConfig)
+
+    def dropout_for(self, n_factors: int) -> float:
+        """The dropout share that is meant for states of ``n_factors`` factors."""
+        if self.dropout is not None:
+            return self.dropout
+        return 0.4 if n_factors > 1 else 0.0
 
     @classmethod
     def paper(cls, n_variables: int) -> NeuralConfig:

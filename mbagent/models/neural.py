@@ -59,6 +59,7 @@ class NeuralTransitionModel(BaseTransitionModel):
         self.codec = FactorCodec(self.cardinalities, self.n_actions)
         self._body = body
         self._layout = pack_layout(self.codec)
+        self._dropout = self.config.dropout_for(len(self.cardinalities))
         self._build(seed)
 
     def _build(self, seed: int) -> None:
@@ -67,7 +68,7 @@ class NeuralTransitionModel(BaseTransitionModel):
         if self._body is not None:
             self.predictor = self._body(self.codec, generator)
         else:
-            shape = (config.hidden, config.activation, config.residual, config.dropout)
+            shape = (config.hidden, config.activation, config.residual, self._dropout)
             self.predictor = DensePredictor(self.codec, *shape, generator=generator)
         self.conditioner: Conditioner | None = None
         if config.conditioner is not None:
@@ -84,7 +85,7 @@ class NeuralTransitionModel(BaseTransitionModel):
             config.group_size,
             config.activation,
             config.correction,
-            config.dropout,
+            self._dropout,
             grouped,
             generator=generator,
         )

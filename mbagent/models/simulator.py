@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from mbagent_envs import Game
+from mbagent_envs.random_keys import derive
 from numpy.typing import NDArray
 
 from mbagent.models.base import (
@@ -45,6 +46,10 @@ class SimulatorModel(BaseTransitionModel):
         if progress is not None:
             progress(1.0)
         return FitReport(n_train=len(data), n_validation=0, epochs=0, seconds=0.0)
+
+    def start_states(self, n: int, seed: int = 0) -> States:
+        """Start states int64 [n, F] of the game: an agent with this model can plan without having learned."""
+        return self._factors(self.game.initial(derive(np.full(n, seed, dtype=np.uint64), np.arange(n))))
 
     def _observations(self, states: States) -> NDArray[np.int8]:
         return np.ascontiguousarray(states, dtype=np.int8).reshape(len(states), *self._shape)

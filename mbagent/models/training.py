@@ -44,11 +44,11 @@ class TrainingConfig:
         online_learning_rate: Adam's, in the on-line method.
     """
 
-    learning_rate: float = 0.01
+    learning_rate: float = 0.02
     weight_decay: float = 0.01
     batch_size: int = 256
     epochs: float = 30.0
-    min_steps: int = 1500
+    min_steps: int = 2000
     max_steps: int = 6000
     validation: float = 0.1
     checks: int = 40

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from mbagent.analysis import jobs
 from mbagent.analysis.cases import find_case
 from mbagent.analysis.comparison import FULL, QUICK, Settings, load, plan_jobs, run
 from mbagent.analysis.jobs import Job, RewardOnly, run_job
@@ -28,45 +27,6 @@ from mbagent.analysis.report import format_interval, format_number, write_report
 from mbagent.analysis.runner import JobsFailedError, run_jobs
 from mbagent.analysis.statistics import Interval
 from mbagent.analysis.summary import save_csv, summarise
-
-
-class FakeModel:
-    def state_dict(self) -> dict[str, Any]:
-        return {"a": np.arange(3.0), "b": np.ones((2, 2))}
-
-
-class FakeAgent:
-    def __init__(self, policy: str, env: Any, *, seed: int, model: Any = None) -> None:
-        self.n_actions = int(env.action_space.n)
-        self.model = model or FakeModel()
-        self.seed = seed
-        self.num_timesteps = 0
-        self.goals: list[Any] = []
-
-    def learn(self, total_timesteps: int, callback: Any = None) -> "FakeAgent":
-        self.num_timesteps = total_timesteps
-        return self
-
-    def set_env(self, env: Any) -> None:
-        assert not hasattr(env.unwrapped, "reward_fn")
-
-    def set_reward(self, reward: Any) -> None:
-        self.goals.append(reward)
-
-    def predict(self, obs: Any, deterministic: bool = False) -> tuple[Any, None]:
-        rows = np.asarray(obs).reshape(len(obs), -1).astype(np.int64)
-        return (rows @ np.arange(1, rows.shape[1] + 1) + self.seed) % self.n_actions, None
-
-
-def fake_baseline(name: str, make_env: Any, *, steps: int, seed: int, evaluate: Any, report: Any) -> Any:
-    return FakeAgent("MlpPolicy", make_env(), seed=seed).learn(steps), [(0, 1.0), (steps, 2.0)]
-
-
-@pytest.fixture
-def fake_agent(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jobs, "ModelLearningAgent", FakeAgent)
-    monkeypatch.setattr(jobs, "train_baseline", fake_baseline)
-
 
 TINY = Settings(
     steps=1000,
@@ -102,7 +62,7 @@ def test_full_trains_longer_baselines_and_at_least_five_seeds_with_a_hundred_epi
     assert FULL.seeds * FULL.episodes >= 100
 
 
-@pytest.mark.usefixtures("fake_agent")
+@pytest.mark.usefixtures("fake_agents")
 def test_a_whole_comparison_becomes_one_page_and_one_table(tmp_path: Path) -> None:
     records = run(TINY, tmp_path, workers=1, console=quiet())
     results = summarise(records, TINY)
@@ -126,7 +86,7 @@ def test_a_whole_comparison_becomes_one_page_and_one_table(tmp_path: Path) -> No
     assert len({line.count(",") for line in table}) == 2  # the one agent with a comma in its name is quoted
 
 
-@pytest.mark.usefixtures("fake_agent")
+@pytest.mark.usefixtures("fake_agents")
 def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = replace(TINY, seeds=1, cases=("geyser_low_cost",), curve_steps=())
     first = run(settings, tmp_path, workers=1, console=quiet())
@@ -163,6 +123,14 @@ def test_a_failing_job_is_named_and_the_others_are_kept(
     assert (tmp_path / good.file_name).exists()
     assert "Traceback" in (tmp_path / "errors.log").read_text(encoding="utf-8")
     assert not list(tmp_path.glob("*.progress"))
+
+
+def test_the_real_planner_plays_the_true_rules_perfectly_through_a_job() -> None:
+    records = run_job(Job(TRUE_MODEL, "geyser_high_cost", 0, 0, 5, ("default", "left"), 5))
+    assert [r.goal for r in records] == ["default", "left"]
+    assert records[0].mean == pytest.approx(43.78, abs=0.3)
+    assert records[1].mean == 100
+    assert records[0].decision_ms > 0
 
 
 def test_records_survive_the_disk(tmp_path: Path) -> None:

@@ -1,0 +1,160 @@
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3 import PPO
+
+from mbagent import ModelLearningAgent, persistence
+from mbagent.models.factory import build_auto, register_model
+from tests.worlds import Corridor, TableWorld, random_table
+
+GEYSER = "mbagent/GeyserRunner-v0"
+
+
+def corner(obs: Any, action: Any, next_obs: Any) -> Any:
+    """Reward for the first column."""
+    return next_obs[:, 0]
+
+
+@pytest.fixture(scope="module")
+def agent() -> ModelLearningAgent:
+    return ModelLearningAgent("MctsPolicy", gym.make(GEYSER, hit_cost=5.0), seed=0).learn(3000, log_interval=None)
+
+
+def observations() -> np.ndarray:
+    env = gym.make(GEYSER)
+    env.action_space.seed(0)
+    rows = [env.reset(seed=0)[0]]
+    rows += [env.step(env.action_space.sample())[0] for _ in range(30)]
+    return np.stack(rows)
+
+
+@pytest.mark.parametrize("with_env", [True, False])
+def test_predictions_are_the_same_after_loading(agent: ModelLearningAgent, tmp_path: Path, with_env: bool) -> None:
+    before, _ = agent.predict(observations(), deterministic=True)
+    agent.save(tmp_path / "agent")
+    if with_env:
+        loaded = ModelLearningAgent.load(tmp_path / "agent", env=gym.make(GEYSER, hit_cost=5.0))
+    else:
+        with pytest.warns(UserWarning, match="no environment"):
+            loaded = ModelLearningAgent.load(tmp_path / "agent")
+    after, _ = loaded.predict(observations(), deterministic=True)
+    alone = [int(loaded.predict(obs, deterministic=True)[0]) for obs in observations()]
+    assert before.tolist() == after.tolist() == alone
+
+
+def test_a_loaded_agent_learns_on(agent: ModelLearningAgent, tmp_path: Path) -> None:
+    agent.save(tmp_path / "agent", include=["transitions"])
+    loaded = ModelLearningAgent.load(tmp_path / "agent", env=gym.make(GEYSER, hit_cost=5.0), num_simulations=8)
+    assert loaded.num_simulations == 8
+    loaded.learn(200, reset_num_timesteps=False, log_interval=None)
+    assert loaded.num_timesteps == 3200
+    assert len(loaded.transitions) == 3200
+
+
+def test_a_custom_reward_must_be_given_again(agent: ModelLearningAgent, tmp_path: Path) -> None:
+    env = gym.make(GEYSER)
+    agent.set_reward(corner)
+    expected, _ = agent.predict(observations())
+    agent.save(tmp_path / "corner.zip")
+    agent.set_reward(None)
+    loaded = ModelLearningAgent.load(tmp_path / "corner.zip", env=env)
+    with pytest.raises(ValueError, match="set_reward"):
+        loaded.predict(observations())
+    loaded.set_reward(corner)
+    assert loaded.predict(observations())[0].tolist() == expected.tolist()
+    again = ModelLearningAgent.load(tmp_path / "corner.zip", env=env, reward=corner)
+    assert again.predict(observations())[0].tolist() == expected.tolist()
+
+
+def test_parameters_travel_between_agents(agent: ModelLearningAgent, tmp_path: Path) -> None:
+    agent.save(tmp_path / "agent.zip")
+    for source in (agent.get_parameters(), str(tmp_path / "agent.zip")):
+        other = ModelLearningAgent("MctsPolicy", gym.make(GEYSER, hit_cost=5.0), seed=9)
+        other.set_parameters(source)
+        for name, value in agent.model.state_dict().items():
+            np.testing.assert_array_equal(other.model.state_dict()[name], value)
+        assert other.policy.fitted
+
+
+def test_wrong_parameters_change_nothing(agent: ModelLearningAgent) -> None:
+    before = agent.model.state_dict()
+    wrong = agent.get_parameters()
+    wrong["policy"] = {k: v[..., :1] if v.ndim else v for k, v in wrong["policy"].items()}
+    with pytest.raises(ValueError, match="do not fit"):
+        agent.set_parameters(wrong)
+    for name, value in agent.model.state_dict().items():
+        np.testing.assert_array_equal(before[name], value)
+
+
+def test_the_file_holds_json_and_plain_arrays_only(agent: ModelLearningAgent) -> None:
+    buffer = io.BytesIO()
+    agent.save(buffer)
+    with zipfile.ZipFile(buffer) as archive:
+        assert json.loads(archive.read("data"))["policy_class"] == "MctsPolicy"
+        for name in archive.namelist():
+            assert name in {"data", "policy.npz", "planning.npz", "_stable_baselines3_version", "system_info.txt"}
+            if name.endswith(".npz"):
+                with np.load(io.BytesIO(archive.read(name)), allow_pickle=False) as arrays:
+                    assert all(arrays[key].dtype != object for key in arrays.files)
+
+
+def test_a_file_with_code_in_it_is_refused_by_the_entrys_name(tmp_path: Path) -> None:
+    PPO("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8).save(tmp_path / "ppo.zip")
+    with pytest.raises(ValueError, match=r"\.pth.*pickle"):
+        ModelLearningAgent.load(tmp_path / "ppo.zip")
+    with zipfile.ZipFile(tmp_path / "evil.zip", "w") as archive:
+        archive.writestr("data", json.dumps({"settings": {":type:": "x", ":serialized:": "gASV"}}))
+    with pytest.raises(ValueError, match="'settings'"):
+        ModelLearningAgent.load(tmp_path / "evil.zip")
+
+
+def test_missing_and_damaged_files_are_told_apart(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        ModelLearningAgent.load(tmp_path / "nowhere")
+    (tmp_path / "noise.zip").write_bytes(b"noise")
+    with pytest.raises(ValueError, match="damaged"):
+        ModelLearningAgent.load(tmp_path / "noise.zip")
+
+
+def test_custom_models_are_saved_only_when_registered(tmp_path: Path) -> None:
+    world = TableWorld(random_table(5, 2, 0))
+    agent = ModelLearningAgent("MctsPolicy", Corridor(), model=world)
+    with pytest.raises(ValueError, match="register_model"):
+        agent.save(tmp_path / "a.zip")
+    register_model("my-model", build_auto)
+    named = ModelLearningAgent("MctsPolicy", Corridor(), model="my-model", seed=0)
+    named.save(tmp_path / "b.zip")
+    assert ModelLearningAgent.load(tmp_path / "b.zip").model_name == "my-model"
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Discrete(5, start=-2),
+        spaces.MultiDiscrete([3, 4], start=[1, 0]),
+        spaces.MultiBinary(3),
+        spaces.MultiBinary((3,)),
+        spaces.MultiBinary((2, 3)),
+        spaces.Box(0, 3, (2, 2), dtype=np.uint8),
+        spaces.Dict({"b": spaces.Discrete(2), "a": spaces.Tuple([spaces.MultiBinary(2), spaces.Discrete(3)])}),
+    ],
+)
+def test_spaces_survive_json(space: spaces.Space[Any]) -> None:
+    assert persistence.space_from_json(json.loads(json.dumps(persistence.space_to_json(space)))) == space
+
+
+def test_transitions_travel_in_plain_files(agent: ModelLearningAgent, tmp_path: Path) -> None:
+    agent.save_transitions(str(tmp_path / "seen.npz"))
+    other = ModelLearningAgent("MctsPolicy", gym.make(GEYSER), seed=3)
+    other.load_transitions(str(tmp_path / "seen.npz"))
+    np.testing.assert_array_equal(other.transitions.rows().next_states, agent.transitions.rows().next_states)
+    with pytest.raises(ValueError, match="another environment"):
+        ModelLearningAgent("MctsPolicy", Corridor()).load_transitions(str(tmp_path / "seen.npz"))
+    assert len(other.transitions) == 3000
