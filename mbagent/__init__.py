@@ -5,7 +5,6 @@ Importing this package registers the games ``mbagent/GeyserRunner-v0``, ``mbagen
 """
 
 import mbagent_envs
-
 from mbagent.agent import ModelLearningAgent
 from mbagent.planning.planner import PlannerSettings
 from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy

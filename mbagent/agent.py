@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import get_system_info, safe_mean
+from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
-from mbagent import persistence
 from mbagent.experience import ExperienceRecorder, distinct_rows
 from mbagent.exploration import EXPLORATIONS, Exploration
 from mbagent.goals import GoalBook
@@ -26,7 +22,7 @@ from mbagent.models.factory import build_model
 from mbagent.planning.planner import PlannerSettings
 from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
 from mbagent.rewards import RewardFn
-from mbagent.saving import load_agent, save_agent
+from mbagent.saving import SavableAlgorithm
 from mbagent.spaces import ActionEnumeration, FactoredSpace
 from mbagent.transitions import TransitionDataset
 from mbagent.wrapping import wrap_env
@@ -38,7 +34,7 @@ MAX_START_STATES = 512
 """Start states kept for generating the reachable machine."""
 
 
-class ModelLearningAgent(BaseAlgorithm):
+class ModelLearningAgent(SavableAlgorithm):
     """An SB3 algorithm that learns how the world works without reward, and plans on what it learned.
 
     ``learn`` explores at random, records transitions and fits a transition model (paper section 3). ``predict`` plans
@@ -47,10 +43,12 @@ class ModelLearningAgent(BaseAlgorithm):
     Args:
         policy: the planner: "MctsPolicy" (also "MlpPolicy", "CnnPolicy", "MultiInputPolicy"), "FlatMonteCarloPolicy",
             "ValueIterationPolicy", or a subclass of PlannerPolicy.
-        env: a Gymnasium environment, an SB3 VecEnv, or a registered id; its spaces must be discrete (see FactoredSpace).
+        env: a Gymnasium environment, an SB3 VecEnv, or a registered id; its spaces must be discrete (see
+            FactoredSpace).
         learning_rate: largest rate of the fit's one-cycle schedule; a function of progress is evaluated at its start.
         reward: the goal, see RewardFn; None for the environment's own.
-        model: "auto" (structure from the space), "paper" (section 3's networks), another registered name, or a TransitionModel.
+        model: "auto" (structure from the space), "paper" (section 3's networks), another registered name, or a
+            TransitionModel.
         exploration: "auto" or "random".
         gamma: discount of a step when planning.
         num_simulations: simulations for each decision.
@@ -268,9 +266,12 @@ class ModelLearningAgent(BaseAlgorithm):
             new_obs, rewards, dones, infos = env.step(actions)
             self.num_timesteps += env.num_envs
             if self._vec_normalize_env is not None:
-                new_obs, rewards = self._vec_normalize_env.get_original_obs(), self._vec_normalize_env.get_original_reward()
+                new_obs, rewards = (
+                    self._vec_normalize_env.get_original_obs(),
+                    self._vec_normalize_env.get_original_reward(),
+                )
             recorder.record(indices, new_obs, rewards, dones, infos)
-            self._last_obs, self._last_episode_starts = new_obs, dones
+            self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]  # Tuple spaces too
             self._update_info_buffer(infos, dones)
             self._episode_num += int(dones.sum())
             callback.update_locals(locals())
@@ -331,70 +332,6 @@ class ModelLearningAgent(BaseAlgorithm):
         loaded = TransitionDataset.load(path)
         self.transitions.take(loaded)
 
-    # ------------------------------------------------------------------ files
-
-    def save(  # type: ignore[override]
-        self, path: persistence.Target, exclude: Sequence[str] | None = None, include: Sequence[str] | None = None
-    ) -> None:
-        """Writes settings, weights, start states and the learned reward to a zip that holds no code (see persistence).
-
-        Args:
-            path: a path (".zip" is added where there is no suffix) or an open binary file.
-            exclude: accepted as in SB3; nothing here can be left out.
-            include: ``["transitions"]`` adds what was experienced.
-
-        Raises:
-            ValueError: the model or the exploration is an object that a file cannot rebuild.
-        """
-        del exclude
-        save_agent(self, path, include or ())
-
-    @classmethod
-    def load(  # type: ignore[override]
-        cls,
-        path: persistence.Target,
-        env: GymEnv | None = None,
-        device: torch.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
-        print_system_info: bool = False,
-        force_reset: bool = True,
-        *,
-        reward: RewardFn | None = None,
-        **kwargs: Any,
-    ) -> Self:
-        """The agent that ``save`` wrote; no code in the file is ever run.
-
-        Args:
-            path: where it was written.
-            env: a new environment, with the same spaces.
-            device: torch device.
-            custom_objects: accepted as in SB3; files hold no objects that could be replaced.
-            print_system_info: accepted as in SB3.
-            force_reset: whether ``learn`` starts with a reset.
-            reward: the goal; needed again if it was a custom one.
-            **kwargs: constructor arguments that override the saved ones.
-
-        Raises:
-            FileNotFoundError, ValueError: no such file, or no saved agent.
-        """
-        del custom_objects
-        if print_system_info:
-            get_system_info()
-        return load_agent(cls, path, env, reward, force_reset, {"device": device, **kwargs})
-
-    def set_parameters(
-        self,
-        load_path_or_dict: str | Mapping[str, Any],  # type: ignore[override]
-        exact_match: bool = True,
-        device: torch.device | str = "auto",
-    ) -> None:
-        """Takes weights from a saved agent or from ``get_parameters``; planning caches are dropped, the goal stays."""
-        params = load_path_or_dict
-        if not isinstance(params, Mapping):
-            params = {"policy": persistence.read(os.fspath(params))[1]["policy"]}
-        super().set_parameters(dict(params), exact_match, device)
-        self._refresh()
-
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Changes the environment (same spaces); without a custom reward the goal becomes the new environment's."""
         super().set_env(env, force_reset)
@@ -402,9 +339,3 @@ class ModelLearningAgent(BaseAlgorithm):
         self._recorder = None
         self.goals.take_environment(self.env)
         self._refresh()
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "policy", "transitions", "goals"]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy"], []

@@ -49,7 +49,12 @@ class ExperienceRecorder:
         self._starts.append(self.states[which])
 
     def record(
-        self, actions: Actions, new_obs: Any, rewards: NDArray[Any], dones: NDArray[Any], infos: list[dict[str, Any]]
+        self,
+        actions: Actions,
+        new_obs: Any,
+        rewards: NDArray[Any],
+        dones: NDArray[Any],
+        infos: list[dict[str, Any]],
     ) -> None:
         """Adds one step of every environment.
 
@@ -58,7 +63,8 @@ class ExperienceRecorder:
             new_obs: what the vector environment returned: where an episode ended, already the next one's first.
             rewards: float [B].
             dones: bool [B].
-            infos: SB3's: the true last observation is in ``terminal_observation``, a truncation in ``TimeLimit.truncated``.
+            infos: SB3's: the true last observation is in ``terminal_observation``, a truncation in
+                ``TimeLimit.truncated``.
         """
         assert self.states is not None
         following = self._space.encode(new_obs)

@@ -29,7 +29,8 @@ class GoalBook:
         transitions: what was met.
 
     Attributes:
-        source: where the current goal comes from; "missing" after loading an agent whose custom reward was not given again.
+        source: where the current goal comes from; "missing" after loading an agent whose custom reward was not given
+            again.
         learned: whether the reward model is fitted to all transitions.
     """
 

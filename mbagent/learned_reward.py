@@ -34,9 +34,7 @@ class LearnedReward:
         seed: of weights and batches.
     """
 
-    def __init__(
-        self, cardinalities: tuple[int, ...], n_actions: int, planes: PlaneLayout | None = None, seed: int = 0
-    ) -> None:
+    def __init__(self, cardinalities: tuple[int, ...], n_actions: int, planes: PlaneLayout | None = None, seed: int = 0) -> None:
         """See the class."""
         self._codec, self._planes, self._seed = FactorCodec(cardinalities, n_actions), planes, seed
         self._values = np.zeros(1)
@@ -66,9 +64,7 @@ class LearnedReward:
         return float(np.average(close, weights=weights))
 
     def _train(self, rows: TransitionBatch, weights: Tensor) -> None:
-        states, actions, next_states = (
-            torch.from_numpy(part) for part in (rows.states, rows.actions, rows.next_states)
-        )
+        states, actions, next_states = (torch.from_numpy(part) for part in (rows.states, rows.actions, rows.next_states))
         if self._classes:
             targets = torch.from_numpy(np.searchsorted(self._values, rows.rewards))
         else:
@@ -171,9 +167,7 @@ def _distinct(rows: TransitionBatch) -> tuple[TransitionBatch, NDArray[np.float3
     """
     triples = hash_rows(np.concatenate([rows.states, rows.actions[:, None], rows.next_states], axis=1))
     bits = np.ascontiguousarray(rows.rewards).view(np.int64)
-    _, first, counts = np.unique(
-        np.stack([triples.view(np.int64), bits], axis=1), axis=0, return_index=True, return_counts=True
-    )
+    _, first, counts = np.unique(np.stack([triples.view(np.int64), bits], axis=1), axis=0, return_index=True, return_counts=True)
     _, inverse = np.unique(triples[first], return_inverse=True)
     shares = counts / np.bincount(inverse, weights=counts)[inverse]
     return rows.select(first), shares.astype(np.float32)

@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from gymnasium import spaces
-from mbagent_envs.random_keys import derive
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
@@ -21,6 +20,7 @@ from mbagent.planning.machine_planner import MachinePlanner
 from mbagent.planning.mcts import MctsPlanner
 from mbagent.planning.planner import Plan, Planner, PlannerSettings
 from mbagent.spaces import ActionEnumeration, FactoredSpace
+from mbagent_envs.random_keys import derive
 
 NO_GOAL = (
     "This agent was saved with a custom reward function, and files hold no code: give it again with "
@@ -61,7 +61,7 @@ class PlannerPolicy(BasePolicy):
         self.factored = FactoredSpace(observation_space)
         self.actions = ActionEnumeration(action_space)
         self.transition_model, self.reward_model, self.settings = model, reward_model, settings
-        self.planner: Planner = self.planner_class(settings)  # type: ignore[call-arg]
+        self.planner: Planner = self.planner_class(settings)
         self.start_states: States = np.zeros((0, len(self.factored)), dtype=np.int64)
         self.goal: Goal | None = None
         self.fitted = False
@@ -142,9 +142,7 @@ class PlannerPolicy(BasePolicy):
         parts = {"model": self.transition_model.state_dict(), "reward": self.reward_model.state_dict()}
         return {f"{part}.{name}": value for part, state in parts.items() for name, value in state.items()}
 
-    def load_state_dict(  # type: ignore[override]
-        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
-    ) -> None:
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> None:
         """Takes weights over and drops every cache.
 
         Raises:

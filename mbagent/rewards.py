@@ -51,7 +51,11 @@ class GivenReward:
         """Rewards float64 [M]; see planning.goal."""
         if len(actions) == 0:
             return np.zeros(0)
-        batch = (self._space.decode_wide(states), self._actions.decode_wide(actions), self._space.decode_wide(next_states))
+        batch = (
+            self._space.decode_wide(states),
+            self._actions.decode_wide(actions),
+            self._space.decode_wide(next_states),
+        )
         result = self.fn(*batch)
         try:
             rewards = np.asarray(result, dtype=np.float64)

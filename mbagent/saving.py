@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+import os
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 
 from mbagent import persistence
 from mbagent.rewards import RewardFn
@@ -17,14 +20,97 @@ from mbagent.transitions import TransitionBatch
 if TYPE_CHECKING:
     from mbagent.agent import ModelLearningAgent
 
-_Agent = TypeVar("_Agent", bound="ModelLearningAgent")
-
-SETTINGS = ("gamma", "num_simulations", "horizon", "policy_kwargs", "stats_window_size", "tensorboard_log", "verbose", "seed")
+SETTINGS = (
+    "gamma",
+    "num_simulations",
+    "horizon",
+    "policy_kwargs",
+    "stats_window_size",
+    "tensorboard_log",
+    "verbose",
+    "seed",
+)
 """Constructor arguments kept as they are; keyword arguments of ``load`` override them."""
 
 
-def save_agent(agent: ModelLearningAgent, target: persistence.Target, include: Sequence[str]) -> None:
-    """See ModelLearningAgent.save."""
+class SavableAlgorithm(BaseAlgorithm):
+    """What ModelLearningAgent does with files; SB3's own ``load`` would run code that a hostile file holds."""
+
+    def save(  # type: ignore[override]
+        self,
+        path: persistence.Target,
+        exclude: Sequence[str] | None = None,
+        include: Sequence[str] | None = None,
+    ) -> None:
+        """Writes settings, weights, start states and the learned reward to a zip that holds no code (see persistence).
+
+        Args:
+            path: a path (".zip" is added where there is no suffix) or an open binary file.
+            exclude: accepted as in SB3; nothing here can be left out.
+            include: ``["transitions"]`` adds what was experienced.
+
+        Raises:
+            ValueError: the model or the exploration is an object that a file cannot rebuild.
+        """
+        del exclude
+        _save(cast("ModelLearningAgent", self), path, include or ())
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls,
+        path: persistence.Target,
+        env: GymEnv | None = None,
+        device: torch.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        *,
+        reward: RewardFn | None = None,
+        **kwargs: Any,
+    ) -> Self:
+        """The agent that ``save`` wrote; no code in the file is ever run.
+
+        Args:
+            path: where it was written.
+            env: a new environment, with the same spaces.
+            device: torch device.
+            custom_objects: accepted as in SB3; files hold no objects that could be replaced.
+            print_system_info: accepted as in SB3.
+            force_reset: whether ``learn`` starts with a reset.
+            reward: the goal; needed again if it was a custom one.
+            **kwargs: constructor arguments that override the saved ones.
+
+        Raises:
+            FileNotFoundError, ValueError: no such file, or no saved agent.
+        """
+        del custom_objects
+        if print_system_info:
+            get_system_info()
+        return cast(
+            "Self", _load(cast("type[ModelLearningAgent]", cls), path, env, reward, force_reset, {"device": device, **kwargs})
+        )
+
+    def set_parameters(
+        self,
+        load_path_or_dict: str | Mapping[str, Any],
+        exact_match: bool = True,
+        device: torch.device | str = "auto",
+    ) -> None:
+        """Takes weights from a saved agent or from ``get_parameters``; planning caches are dropped, the goal stays."""
+        params = load_path_or_dict
+        if not isinstance(params, Mapping):
+            params = {"policy": persistence.read(os.fspath(params))[1]["policy"]}
+        super().set_parameters(dict(params), exact_match, device)
+        cast("ModelLearningAgent", self)._refresh()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "policy", "transitions", "goals"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy"], []
+
+
+def _save(agent: ModelLearningAgent, target: persistence.Target, include: Sequence[str]) -> None:
     unknown = sorted(set(include) - {"transitions"})
     if unknown:
         raise ValueError(f"include takes 'transitions' only, got {unknown[0]!r}; everything else is saved anyway.")
@@ -74,17 +160,22 @@ def _policy_name(agent: ModelLearningAgent) -> str:
     )
 
 
-def load_agent(
-    cls: type[_Agent],
+def _load(
+    cls: type[ModelLearningAgent],
     source: persistence.Target,
     env: GymEnv | None,
     reward: RewardFn | None,
     force_reset: bool,
     overrides: dict[str, Any],
-) -> _Agent:
-    """See ModelLearningAgent.load."""
+) -> ModelLearningAgent:
     data, arrays = persistence.read(source)
-    allowed = set(inspect.signature(cls.__init__).parameters) - {"self", "policy", "env", "reward", "_init_setup_model"}
+    allowed = set(inspect.signature(cls.__init__).parameters) - {
+        "self",
+        "policy",
+        "env",
+        "reward",
+        "_init_setup_model",
+    }
     unknown = sorted(set(overrides) - allowed)
     if unknown:
         raise TypeError(f"load() has no argument {unknown[0]!r}; it takes {', '.join(sorted(allowed))}.")

@@ -68,7 +68,8 @@ class FactoredSpace:
     """Translates between batches of a discrete space and arrays of factors; the two directions are exact inverses.
 
     Args:
-        space: Discrete, MultiDiscrete, MultiBinary, integer or boolean Box, or a Dict or Tuple of these, nested at will.
+        space: Discrete, MultiDiscrete, MultiBinary, integer or boolean Box, or a Dict or Tuple of these, nested at
+            will.
         kind: word for error messages, "observation" or "action".
 
     Attributes:
@@ -99,7 +100,8 @@ class FactoredSpace:
         """Factors of a batch.
 
         Args:
-            batch: laid out as ``gymnasium.vector.utils.batch_space`` does: arrays [B, ...], in Dicts and Tuples by leaf.
+            batch: laid out as ``gymnasium.vector.utils.batch_space`` does: arrays [B, ...], in Dicts and Tuples by
+                leaf.
 
         Returns:
             int64 [B, F].
@@ -177,7 +179,8 @@ class ActionEnumeration:
     def encode(self, batch: Any) -> NDArray[np.int64]:
         """Action numbers [B] of a batch in the space's own form."""
         factors = self.factored.encode(batch)
-        return np.ravel_multi_index(tuple(factors.T), self.factored.cardinalities).astype(np.int64)
+        indices: NDArray[np.int64] = np.ravel_multi_index(tuple(factors.T), self.factored.cardinalities).astype(np.int64)
+        return indices
 
     def decode(self, indices: NDArray[Any]) -> Any:
         """The batch of actions, in the space's own form, with the numbers ``indices`` [B]."""
@@ -211,9 +214,7 @@ def _leaves(space: spaces.Space[Any], path: tuple[str | int, ...], kind: str) ->
     yield _Leaf(path, space, low, tuple(sizes), shape)
 
 
-def _value_range(
-    space: spaces.Space[Any], path: tuple[str | int, ...], kind: str
-) -> tuple[NDArray[np.int64], list[int]]:
+def _value_range(space: spaces.Space[Any], path: tuple[str | int, ...], kind: str) -> tuple[NDArray[np.int64], list[int]]:
     """Lowest value [n] and number of values [n] of each variable of an elementary space."""
     if isinstance(space, spaces.Discrete):
         return np.array([int(space.start)], dtype=np.int64), [int(space.n)]
@@ -277,7 +278,7 @@ def _descend(batch: Any, path: tuple[str | int, ...], kind: str) -> Any:
         missing = isinstance(batch, Mapping) and key not in batch
         if missing or not isinstance(batch, Mapping | Sequence):
             raise ValueError(f"The {kind} batch has no part {key!r}; pass batched leaves for every part of the space.")
-        batch = batch[key]
+        batch = batch[key]  # type: ignore[index]  # a str for a Mapping, an int for a Sequence
     return batch
 
 

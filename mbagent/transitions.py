@@ -73,10 +73,13 @@ class TransitionDataset:
         if batch.states.shape != (len(batch), len(self.cardinalities)) or batch.next_states.shape != batch.states.shape:
             raise ValueError(
                 f"These transitions have states of shape {batch.states.shape} and next states of shape "
-                f"{batch.next_states.shape}, but this dataset holds {len(self.cardinalities)} factors; they come from another environment."
+                f"{batch.next_states.shape}, but this dataset holds {len(self.cardinalities)} factors; "
+                "they come from another environment."
             )
-        if len(batch) and not (0 <= batch.actions.min() and batch.actions.max() < self.n_actions):
-            raise ValueError(f"These transitions have actions outside 0 ... {self.n_actions - 1}; they come from another environment.")
+        if len(batch) and not (batch.actions.min() >= 0 and batch.actions.max() < self.n_actions):
+            raise ValueError(
+                f"These transitions have actions outside 0 ... {self.n_actions - 1}; they come from another environment."
+            )
         self._chunks.append(batch)
 
     def take(self, other: TransitionDataset) -> None:
@@ -138,6 +141,7 @@ class TransitionDataset:
             Path(path),
             cardinalities=np.array(self.cardinalities),
             n_actions=np.array(self.n_actions),
+            allow_pickle=False,
             **{name: _narrow(getattr(rows, name), name, small) for name in _COLUMNS},
         )
 

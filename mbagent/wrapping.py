@@ -22,7 +22,7 @@ def wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> Vec
         if monitor_wrapper and not is_wrapped(env, Monitor):
             env = Monitor(env)
         if verbose >= 1:
-            print("Wrapping the env in a Monitor and a DummyVecEnv.")
+            print("Wrapping the env in a Monitor and a DummyVecEnv.")  # noqa: T201 - as SB3 does
         single = env
         env = DummyVecEnv([lambda: single])
     return env

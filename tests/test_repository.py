@@ -6,9 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SOURCES = sorted(
-    p for folder in ("mbagent", "envs", "scripts", "tests") for p in (ROOT / folder).rglob("*.py")
-)
+SOURCES = sorted(p for folder in ("mbagent", "envs", "scripts", "tests") for p in (ROOT / folder).rglob("*.py"))
 MAX_FILE_LINES = 350
 MAX_FUNCTION_LINES = 45
 
@@ -31,8 +29,7 @@ def test_files_and_functions_stay_short(path: Path) -> None:
     too_long = {
         node.name: lines_without_docstring(node)
         for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-        and lines_without_docstring(node) > MAX_FUNCTION_LINES
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and lines_without_docstring(node) > MAX_FUNCTION_LINES
     }
     assert not too_long
 

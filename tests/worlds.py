@@ -23,9 +23,7 @@ class TableWorld(BaseTransitionModel):
         super().__init__((table.shape[0],), table.shape[1])
         self.table, self.ends = table, np.isin(np.arange(len(table)), ends)
 
-    def fit(
-        self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None
-    ) -> FitReport:
+    def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         return FitReport(len(data), 0, 0, 0.0)
 
     def sample(self, states: Ints, actions: Ints, rng: Randomness) -> tuple[Ints, NDArray[np.bool_]]:
@@ -73,7 +71,7 @@ def arrival_goal(rewards: Floats) -> Callable[[Ints, Ints, Ints], Floats]:
     return lambda states, actions, next_states: rewards[next_states[:, 0]]
 
 
-class Corridor(gym.Env[int, int]):
+class Corridor(gym.Env[Any, Any]):
     """Cells 0 ... n - 1; actions left and right; the right end terminates and pays 1. Without ``reward_fn``."""
 
     def __init__(self, n: int = 5, limit: int | None = None) -> None:

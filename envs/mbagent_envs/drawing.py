@@ -87,9 +87,7 @@ class _Tile:
     def box(self, x: float, y: float, across: float, down: float, corner: float = 0.0) -> _Plane:
         """Return the distance from a box with these half sides and rounded corners."""
         dx, dy = abs(self.x - x) - across + corner, abs(self.y - y) - down + corner
-        distance: _Plane = (
-            np.hypot(np.maximum(dx, 0), np.maximum(dy, 0)) + np.minimum(np.maximum(dx, dy), 0) - corner
-        )
+        distance: _Plane = np.hypot(np.maximum(dx, 0), np.maximum(dy, 0)) + np.minimum(np.maximum(dx, dy), 0) - corner
         return distance
 
     def star(self, points: int, outer: float, inner: float, turn: float = 0.0) -> _Plane:
@@ -132,9 +130,7 @@ def _player_hit(tile: _Tile) -> None:
     for x in (-0.1, 0.1):  # crossed-out eyes
         dx, dy = tile.x - x, tile.y + 0.05
         for slope in (1, -1):
-            tile.fill(
-                np.maximum(np.abs(dx + slope * dy) / math.sqrt(2) - 0.016, np.hypot(dx, dy) - 0.07), INK
-            )
+            tile.fill(np.maximum(np.abs(dx + slope * dy) / math.sqrt(2) - 0.016, np.hypot(dx, dy) - 0.07), INK)
     tile.fill(tile.ellipse(0, 0.13, 0.06, 0.075), INK)
 
 
@@ -286,9 +282,7 @@ def draw_ansi(scene: Scene) -> str:
     cells = np.full((scene.rows, scene.columns), ".")
     for sprite in scene.sprites:
         cells[sprite.row, sprite.column] = SYMBOLS[sprite.kind][0]
-    shown = {
-        SYMBOLS[s.kind]: None for s in scene.sprites if SYMBOLS[s.kind][1] and SYMBOLS[s.kind][0] in cells
-    }
+    shown = {SYMBOLS[s.kind]: None for s in scene.sprites if SYMBOLS[s.kind][1] and SYMBOLS[s.kind][0] in cells}
     legend = "  ".join([f"{symbol} {name}" for symbol, name in shown] + [". free"])
     return "\n".join(["".join(row) for row in cells] + [legend]) + "\n"
 
@@ -308,9 +302,7 @@ class Window:
         try:
             import pygame  # noqa: PLC0415 -- an optional dependency, needed for windows only
         except ImportError as error:
-            raise gym.error.DependencyNotInstalled(
-                'render_mode="human" needs pygame: pip install "mbagent[drawing]"'
-            ) from error
+            raise gym.error.DependencyNotInstalled('render_mode="human" needs pygame: pip install "mbagent[drawing]"') from error
         self._pygame: Any = pygame
         self._title, self._fps = title, fps
         self._clock = pygame.time.Clock()
@@ -319,9 +311,7 @@ class Window:
         """Show ``picture``, uint8 ``[height, width, 3]``, opening the window the first time."""
         pygame, size = self._pygame, (picture.shape[1], picture.shape[0])
         screen = pygame.display.get_surface()
-        if (
-            screen is None or screen.get_size() != size
-        ):  # pygame has one window: another one may have taken it
+        if screen is None or screen.get_size() != size:  # pygame has one window: another one may have taken it
             pygame.display.init()
             screen = pygame.display.set_mode(size)
         pygame.display.set_caption(self._title)

@@ -37,9 +37,7 @@ def resolve_game(game: str | type[Game] | Game, arguments: Mapping[str, Any]) ->
     """
     if isinstance(game, Game):
         if arguments:
-            raise TypeError(
-                f"arguments ({', '.join(arguments)}) go with a game's name or class, not with {game!r}."
-            )
+            raise TypeError(f"arguments ({', '.join(arguments)}) go with a game's name or class, not with {game!r}.")
         return game
     if isinstance(game, str):
         module, _, name = game.partition(":")
@@ -47,18 +45,14 @@ def resolve_game(game: str | type[Game] | Game, arguments: Mapping[str, Any]) ->
     else:
         found = game
     if not (isinstance(found, type) and issubclass(found, Game)):
-        raise ValueError(
-            f"there is no game {game!r}; take one of {', '.join(GAMES)}, 'module:Class', or a Game."
-        )
+        raise ValueError(f"there is no game {game!r}; take one of {', '.join(GAMES)}, 'module:Class', or a Game.")
     return build_game(found, arguments)
 
 
 def check_render_mode(render_mode: str | None) -> str | None:
     """Return ``render_mode``, or raise ValueError if there is no such mode."""
     if render_mode is not None and render_mode not in RENDER_MODES:
-        raise ValueError(
-            f"render_mode must be one of {', '.join(RENDER_MODES)} or None, but it is {render_mode!r}."
-        )
+        raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)} or None, but it is {render_mode!r}.")
     return render_mode
 
 
@@ -67,9 +61,7 @@ def check_options(options: Mapping[str, Any] | None, known: tuple[str, ...]) -> 
     given = dict(options or {})
     unknown = [name for name in given if name not in known]
     if unknown:
-        raise ValueError(
-            f"reset knows no option {unknown[0]!r}; its options are {', '.join(map(repr, known))}."
-        )
+        raise ValueError(f"reset knows no option {unknown[0]!r}; its options are {', '.join(map(repr, known))}.")
     return given
 
 
@@ -93,9 +85,7 @@ class GameEnv(gym.Env[Bits, np.int64]):
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 8}  # noqa: RUF012
 
-    def __init__(
-        self, game: str | type[Game] | Game, render_mode: str | None = None, **arguments: Any
-    ) -> None:
+    def __init__(self, game: str | type[Game] | Game, render_mode: str | None = None, **arguments: Any) -> None:
         self.game = resolve_game(game, arguments)
         self.render_mode = check_render_mode(render_mode)
         self.observation_space = copy.deepcopy(self.game.observation_space)  # environments may share a game,
@@ -105,9 +95,7 @@ class GameEnv(gym.Env[Bits, np.int64]):
         self._elapsed = 0
         self._window: Window | None = None
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Bits, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Bits, dict[str, Any]]:
         """Start an episode.
 
         Args:
@@ -200,9 +188,7 @@ class GameEnv(gym.Env[Bits, np.int64]):
             gymnasium.error.DependencyNotInstalled: if a window is wanted and pygame is missing.
         """
         if self.render_mode is None:
-            gym.logger.warn(
-                "render() was called without a render_mode; give one to gymnasium.make, say 'rgb_array'."
-            )
+            gym.logger.warn("render() was called without a render_mode; give one to gymnasium.make, say 'rgb_array'.")
             return None
         if self._obs is None:
             raise gym.error.ResetNeeded("Cannot call env.render() before calling env.reset()")

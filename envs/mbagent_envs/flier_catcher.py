@@ -97,9 +97,7 @@ class FlierCatcher(Game):
 
     max_episode_steps: ClassVar[int] = 200
 
-    def __init__(
-        self, *, height: int = 6, width: int = 10, spawn_rate: float = 0.4, stay: bool = True
-    ) -> None:
+    def __init__(self, *, height: int = 6, width: int = 10, spawn_rate: float = 0.4, stay: bool = True) -> None:
         """See the class."""
         self.height = check_integer("height", height, 2)
         self.width = check_integer("width", width, 2)
@@ -135,14 +133,10 @@ class FlierCatcher(Game):
     def _avoid(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
         return -self.reward(obs, actions, next_obs)
 
-    def _top_row(
-        self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]
-    ) -> Floats:
+    def _top_row(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
         return as_floats(next_obs[:, 0, 0, 0])
 
-    def _catch_low(
-        self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]
-    ) -> Floats:
+    def _catch_low(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
         caught = (next_obs[:, 0] & next_obs[:, 1]).any(axis=2)
         half = self.height // 2
         return as_floats(caught[:, half:].any(axis=1)) - as_floats(caught[:, :half].any(axis=1))

@@ -126,9 +126,7 @@ class Game(ABC):
     def reward(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
         """Return the game's own reward, float64 ``[B]``, of transitions laid out as in `transition`."""
 
-    def terminated(
-        self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]
-    ) -> Bools:
+    def terminated(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Bools:
         """Return which transitions end the episode, bool ``[B]``; by default none does."""
         return np.zeros(len(next_obs), dtype=np.bool_)
 
@@ -146,9 +144,7 @@ class Game(ABC):
         Raises:
             NotImplementedError: if the successors are too many to list.
         """
-        raise NotImplementedError(
-            f"{type(self).__name__} cannot list its successors; sample them with transition()."
-        )
+        raise NotImplementedError(f"{type(self).__name__} cannot list its successors; sample them with transition().")
 
     @abstractmethod
     def scene(self, obs: Bits) -> Scene:
@@ -167,19 +163,14 @@ class Game(ABC):
         array = np.asarray(obs)
         shape = self.observation_space.shape
         if array.ndim != len(shape) + 1 or array.shape[1:] != shape:
-            raise ValueError(
-                f"observations must have shape (B, {', '.join(map(str, shape))}), but it is {array.shape}."
-            )
+            raise ValueError(f"observations must have shape (B, {', '.join(map(str, shape))}), but it is {array.shape}.")
         if not bool(np.isin(array, (0, 1)).all()):
-            raise ValueError(
-                "observations must hold only 0 and 1; pass them as the environment returned them."
-            )
+            raise ValueError("observations must hold only 0 and 1; pass them as the environment returned them.")
         bits = np.ascontiguousarray(array, dtype=np.int8)
         reason = self.invalid(bits)
         if reason is not None:
             raise ValueError(
-                f"not a state of {type(self).__name__}: {reason}; "
-                "pass observations as the environment returned them."
+                f"not a state of {type(self).__name__}: {reason}; pass observations as the environment returned them."
             )
         return bits
 
@@ -191,11 +182,7 @@ class Game(ABC):
         """
         array = np.asarray(actions)
         n = int(self.action_space.n)
-        if (
-            array.dtype.kind not in "iu"
-            or array.shape != (count,)
-            or (count and (array.min() < 0 or array.max() >= n))
-        ):
+        if array.dtype.kind not in "iu" or array.shape != (count,) or (count and (array.min() < 0 or array.max() >= n)):
             raise InvalidActionError(
                 f"actions must be {count} integer{'s' * (count != 1)} from 0 to {n - 1} "
                 f"({', '.join(self.action_names)}), but got {actions!r}."
@@ -220,9 +207,7 @@ def build_game(game_type: type[Game], arguments: Mapping[str, Any]) -> Game:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise TypeError(
-                f"{game_type.__name__} has no argument {name!r} (it takes {', '.join(known)}){hint}"
-            )
+            raise TypeError(f"{game_type.__name__} has no argument {name!r} (it takes {', '.join(known)}){hint}")
     return game_type(**arguments)
 
 
@@ -240,9 +225,7 @@ def check_number(name: str, value: object, minimum: float, maximum: float) -> fl
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise TypeError(f"{name} must be a number, but it is {value!r} of type {type(value).__name__}.")
     if not (minimum <= value <= maximum and np.isfinite(value)):
-        wanted = (
-            f"in [{minimum:g}, {maximum:g}]" if np.isfinite([minimum, maximum]).all() else "a finite number"
-        )
+        wanted = f"in [{minimum:g}, {maximum:g}]" if np.isfinite([minimum, maximum]).all() else "a finite number"
         raise ValueError(f"{name} must be {wanted}, but it is {value}.")
     return float(value)
 

@@ -108,18 +108,14 @@ class GeyserRunner(Game):
 
     max_episode_steps: ClassVar[int] = 100
 
-    def __init__(
-        self, *, mode: str = "stochastic", width: int = 10, hit_cost: float = 2.0, stay: bool = True
-    ) -> None:
+    def __init__(self, *, mode: str = "stochastic", width: int = 10, hit_cost: float = 2.0, stay: bool = True) -> None:
         """See the class."""
         if mode not in MODES:
             raise ValueError(f"mode must be 'stochastic' or 'deterministic', but it is {mode!r}.")
         self.mode = mode
         self.width = check_integer("width", width, 4)
         if self.width % 2:
-            raise ValueError(
-                f"width must be even (its right half holds the geysers), but it is {width}; take {width + 1}."
-            )
+            raise ValueError(f"width must be even (its right half holds the geysers), but it is {width}; take {width + 1}.")
         self.hit_cost = check_number("hit_cost", hit_cost, -math.inf, math.inf)
         self.stay = check_flag("stay", stay)
         geysers = self.width // 2
@@ -172,9 +168,7 @@ class GeyserRunner(Game):
             wet[:, half + shift : self.width + shift] |= next_obs[:, self.width :]
         return as_floats((wet[:, 1:-1] & next_obs[:, : self.width]).any(axis=1))
 
-    def _right_edge(
-        self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]
-    ) -> Floats:
+    def _right_edge(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
         return as_floats(next_obs[:, self.width - 1])
 
     def transition_distribution(self, obs: Bits, action: int) -> tuple[Bits, Floats]:

@@ -176,9 +176,7 @@ class Maneuverer(Game):
         self.size = check_integer("size", size, 2)
         self.wall_density = check_number("wall_density", wall_density, 0.0, 1.0)
         if self.wall_density == 1.0:
-            raise ValueError(
-                "wall_density must be in [0, 1), but it is 1, and no cell could ever be reached; take less."
-            )
+            raise ValueError("wall_density must be in [0, 1), but it is 1, and no cell could ever be reached; take less.")
         goals = {
             "corner": self._corner,
             "next to target": self._next_to,
@@ -210,9 +208,7 @@ class Maneuverer(Game):
     def _corner(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
         return as_floats(next_obs[:, 0, 0, 0])
 
-    def _next_to(
-        self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]
-    ) -> Floats:
+    def _next_to(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
         beside = _sides(next_obs[:, 2], edge=0).any(axis=0)
         return as_floats((next_obs[:, 0] & beside).any(axis=(1, 2)))
 

@@ -16,9 +16,7 @@ from mbagent_envs._compiled import compiled
 KeyArray = npt.NDArray[np.uint64]
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)  # step of splitmix64: 2**64 / golden ratio, odd
-_SALT_GAMMA = np.uint64(
-    0xD1342543DE82EF95
-)  # another odd step, so that derived keys never repeat the stream of their parent
+_SALT_GAMMA = np.uint64(0xD1342543DE82EF95)  # another odd step, so that derived keys never repeat the stream of their parent
 _M1 = np.uint64(0xBF58476D1CE4E5B9)
 _M2 = np.uint64(0x94D049BB133111EB)
 _ONE = np.uint64(1)
@@ -70,9 +68,7 @@ def as_keys(keys: npt.ArrayLike) -> KeyArray:
     """
     array = np.asarray(keys)
     if array.dtype.kind not in "iu":
-        raise TypeError(
-            f"keys must be integers (uint64), but they are {array.dtype}; draw them with draw_keys(rng, n)."
-        )
+        raise TypeError(f"keys must be integers (uint64), but they are {array.dtype}; draw them with draw_keys(rng, n).")
     return np.atleast_1d(array.astype(np.uint64, copy=False))
 
 
@@ -113,9 +109,7 @@ def derive(keys: npt.ArrayLike, *salt: npt.ArrayLike) -> KeyArray:
         salts = as_keys(part)
         rows = len(salts) if len(result) == 1 else len(result)
         if result.ndim != 1 or salts.ndim != 1 or len(salts) not in (1, rows):
-            raise ValueError(
-                f"keys {result.shape} and salt {salts.shape} must have one axis of equal length."
-            )
+            raise ValueError(f"keys {result.shape} and salt {salts.shape} must have one axis of equal length.")
         derived = np.empty(rows, dtype=np.uint64)
         _derive_rows(result, salts, derived)
         result = derived

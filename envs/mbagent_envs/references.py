@@ -25,9 +25,7 @@ ReferencePolicy = Callable[[Bits], Ints]
 _TIE = 1e-7  # values closer than this share of their size are equal: rounding must not decide
 
 
-def reference_policy(
-    game: Game, reward: str | RewardFn = "default", gamma: float = 0.99
-) -> ReferencePolicy | None:
+def reference_policy(game: Game, reward: str | RewardFn = "default", gamma: float = 0.99) -> ReferencePolicy | None:
     """Return a policy that plays ``game`` well for a goal, or None if there is none for this game.
 
     Args:
@@ -158,9 +156,7 @@ class _LayoutPlanner:
             plans = self._plan(obs[list(new.values())])
             self._plans.update(zip(new, plans, strict=True))
         players = obs[:, 0].reshape(len(obs), -1).argmax(axis=1)
-        return np.array(
-            [self._plans[layout][cell] for layout, cell in zip(layouts, players, strict=True)], dtype=np.int64
-        )
+        return np.array([self._plans[layout][cell] for layout, cell in zip(layouts, players, strict=True)], dtype=np.int64)
 
     def _plan(self, obs: Bits) -> Ints:
         """Return the best action for each layout and cell, int64 ``[B, cells]``."""

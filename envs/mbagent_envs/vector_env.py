@@ -55,9 +55,7 @@ class GameVectorEnv(gym.vector.VectorEnv[Bits, npt.NDArray[Any], npt.NDArray[Any
         self.num_envs = check_integer("num_envs", num_envs, 1)
         self.render_mode = check_render_mode(render_mode)
         if self.render_mode == "human":
-            raise ValueError(
-                "render_mode 'human' shows one game; take 'rgb_array' for many, or one environment."
-            )
+            raise ValueError("render_mode 'human' shows one game; take 'rgb_array' for many, or one environment.")
         limit = self.game.max_episode_steps if max_episode_steps is None else max_episode_steps
         self.max_episode_steps = limit if limit == -1 else check_integer("max_episode_steps", limit, 1)
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -123,19 +121,10 @@ class GameVectorEnv(gym.vector.VectorEnv[Bits, npt.NDArray[Any], npt.NDArray[Any
     def _reset_mask(self, mask: Any) -> Bools:
         if mask is None:
             return np.ones(self.num_envs, dtype=np.bool_)
-        if (
-            not isinstance(mask, np.ndarray)
-            or mask.dtype != np.bool_
-            or mask.shape != (self.num_envs,)
-            or not mask.any()
-        ):
-            raise ValueError(
-                f"options['reset_mask'] must be bool ({self.num_envs},) with a True in it; it is {mask!r}."
-            )
+        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (self.num_envs,) or not mask.any():
+            raise ValueError(f"options['reset_mask'] must be bool ({self.num_envs},) with a True in it; it is {mask!r}.")
         if self._obs is None and not mask.all():
-            raise gym.error.ResetNeeded(
-                "the first reset must be of all copies; leave out options['reset_mask']."
-            )
+            raise gym.error.ResetNeeded("the first reset must be of all copies; leave out options['reset_mask'].")
         return mask
 
     def _seed_list(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
@@ -144,9 +133,7 @@ class GameVectorEnv(gym.vector.VectorEnv[Bits, npt.NDArray[Any], npt.NDArray[Any
         if isinstance(seed, (int, np.integer)):
             return [int(seed) + i for i in range(self.num_envs)]
         if len(seed) != self.num_envs:
-            raise ValueError(
-                f"seed must be one integer or {self.num_envs} of them, but there are {len(seed)}."
-            )
+            raise ValueError(f"seed must be one integer or {self.num_envs} of them, but there are {len(seed)}.")
         return list(seed)
 
     def _start_states(self, state: Any) -> Bits:
@@ -155,9 +142,7 @@ class GameVectorEnv(gym.vector.VectorEnv[Bits, npt.NDArray[Any], npt.NDArray[Any
             array = np.broadcast_to(array, (self.num_envs, *array.shape))
         states = self.game.check_observations(array)
         if len(states) != self.num_envs:
-            raise ValueError(
-                f"options['state'] must be one observation or {self.num_envs}, but there are {len(states)}."
-            )
+            raise ValueError(f"options['state'] must be one observation or {self.num_envs}, but there are {len(states)}.")
         return states
 
     def _begin(self, mask: Bools) -> None:
@@ -190,8 +175,7 @@ class GameVectorEnv(gym.vector.VectorEnv[Bits, npt.NDArray[Any], npt.NDArray[Any
         stale = self._done.copy()  # finished in the step before
         if self.autoreset_mode is AutoresetMode.DISABLED and stale.any():
             raise gym.error.ResetNeeded(
-                f"copies {np.flatnonzero(stale).tolist()} have ended; "
-                "reset them with options={'reset_mask': mask} first."
+                f"copies {np.flatnonzero(stale).tolist()} have ended; reset them with options={{'reset_mask': mask}} first."
             )
         self._elapsed += 1
         obs, self._obs = (
@@ -200,18 +184,12 @@ class GameVectorEnv(gym.vector.VectorEnv[Bits, npt.NDArray[Any], npt.NDArray[Any
         )
         rewards = self.game.reward(obs, checked, self._obs)
         terminations = self.game.terminated(obs, checked, self._obs)
-        truncations = (
-            self._elapsed >= self.max_episode_steps if self.max_episode_steps > 0 else np.zeros_like(stale)
-        )
+        truncations = self._elapsed >= self.max_episode_steps if self.max_episode_steps > 0 else np.zeros_like(stale)
         if stale.any():  # this call was their reset
             rewards[stale], terminations[stale], truncations[stale] = 0.0, False, False
             self._begin(stale)
         self._done = terminations | truncations
-        infos = (
-            self._reset_finished()
-            if self.autoreset_mode is AutoresetMode.SAME_STEP and self._done.any()
-            else {}
-        )
+        infos = self._reset_finished() if self.autoreset_mode is AutoresetMode.SAME_STEP and self._done.any() else {}
         return self._obs.copy(), rewards, terminations, truncations, infos
 
     def _reset_finished(self) -> dict[str, Any]:
@@ -232,9 +210,7 @@ class GameVectorEnv(gym.vector.VectorEnv[Bits, npt.NDArray[Any], npt.NDArray[Any
     def render(self) -> tuple[Any, ...] | None:
         """Draw every copy: a tuple of uint8 ``[height, width, 3]`` or of strings, by ``render_mode``."""
         if self.render_mode is None:
-            gym.logger.warn(
-                "render() was called without a render_mode; give one to gymnasium.make_vec, say 'rgb_array'."
-            )
+            gym.logger.warn("render() was called without a render_mode; give one to gymnasium.make_vec, say 'rgb_array'.")
             return None
         if self._obs is None:
             raise gym.error.ResetNeeded("Cannot call envs.render() before calling envs.reset()")

@@ -77,9 +77,7 @@ def best_mode(algorithm: Any, evaluate: Evaluate) -> tuple[bool, float]:
 class _Checkpoints(BaseCallback):
     """Evaluates the policy at evenly spaced numbers of environment steps."""
 
-    def __init__(
-        self, total: int, points: int, evaluate: Evaluate, report: Callable[[float], None] | None
-    ) -> None:
+    def __init__(self, total: int, points: int, evaluate: Evaluate, report: Callable[[float], None] | None) -> None:
         super().__init__()
         self._due = [round(total * (i + 1) / points) for i in range(points)]
         self._total = total

@@ -104,7 +104,6 @@ CASES: tuple[Case, ...] = (
         "around it, so that almost every layout is one it has never seen. One point for each target.",
         "shortest paths",
         exact=False,
-        episodes=2,
         change_goals=True,
     ),
     Case(
@@ -177,9 +176,7 @@ def play(
         return evaluate_env(case.make_env, policy, episodes=episodes, seed=seed, repeatable=repeatable)
     functions = {"default": game.reward, **game.reward_functions}
     chosen = {name: functions[name] for name in goals}
-    return evaluate_game(
-        game, policy, episodes=episodes, seed=seed, goals=chosen, repeatable=repeatable, report=report
-    )
+    return evaluate_game(game, policy, episodes=episodes, seed=seed, goals=chosen, repeatable=repeatable, report=report)
 
 
 @dataclass(frozen=True)

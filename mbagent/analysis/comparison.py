@@ -80,35 +80,23 @@ def plan_jobs(settings: Settings) -> list[Job]:
     return sorted(jobs, key=lambda job: -_COST.get(job.agent, 0.0) * max(job.steps, settings.steps))
 
 
-def _jobs_of_seed(
-    settings: Settings, case: Case, seed: int, steps: int, episodes: int, goals: tuple[str, ...]
-) -> list[Job]:
+def _jobs_of_seed(settings: Settings, case: Case, seed: int, steps: int, episodes: int, goals: tuple[str, ...]) -> list[Job]:
     agent = AGENT if case.reward_given else LEARNED_REWARD
     jobs = [
         Job(RANDOM, case.key, seed, 0, episodes),
         Job(agent, case.key, seed, steps, episodes, goals, case.episodes * settings.goal_episodes),
     ]
     if case.reward_given:
-        jobs.append(
-            Job(TRUE_MODEL, case.key, seed, 0, episodes, goals, case.episodes * settings.goal_episodes)
-        )
+        jobs.append(Job(TRUE_MODEL, case.key, seed, 0, episodes, goals, case.episodes * settings.goal_episodes))
     jobs += [
-        Job(name, case.key, seed, steps * multiple, episodes)
-        for name in BASELINES
-        for multiple in settings.baseline_multiples
+        Job(name, case.key, seed, steps * multiple, episodes) for name in BASELINES for multiple in settings.baseline_multiples
     ]
     if seed < settings.curve_seeds:
-        jobs += [
-            Job(agent, case.key, seed, fewer, episodes, curve=True)
-            for fewer in settings.curve_steps
-            if fewer < steps
-        ]
+        jobs += [Job(agent, case.key, seed, fewer, episodes, curve=True) for fewer in settings.curve_steps if fewer < steps]
     return jobs
 
 
-def run(
-    settings: Settings, folder: Path, *, workers: int, console: Console, resume: bool = False
-) -> list[Record]:
+def run(settings: Settings, folder: Path, *, workers: int, console: Console, resume: bool = False) -> list[Record]:
     """Runs a comparison, keeping every job's records in ``folder / "records"`` as soon as it is done.
 
     Args:
@@ -125,9 +113,7 @@ def run(
     kept, noted = folder / "records", folder / "records" / "settings.json"
     text = json.dumps(asdict(settings), indent=1)
     if resume and noted.exists() and noted.read_text(encoding="utf-8") != text:
-        raise ValueError(
-            f"The run kept in {kept} had other settings; give the same ones, or leave out --resume."
-        )
+        raise ValueError(f"The run kept in {kept} had other settings; give the same ones, or leave out --resume.")
     if not resume and kept.exists():
         shutil.rmtree(kept)
     kept.mkdir(parents=True, exist_ok=True)

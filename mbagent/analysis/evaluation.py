@@ -112,9 +112,7 @@ def evaluate_game(
         # Integers wide enough that a user's sums over planes do not overflow int8.
         wide, wide_next = obs.astype(np.int64), next_obs.astype(np.int64)
         for name, goal in goals.items():
-            returns[name] += np.where(
-                running, np.asarray(goal(wide, actions, wide_next), dtype=np.float64), 0.0
-            )
+            returns[name] += np.where(running, np.asarray(goal(wide, actions, wide_next), dtype=np.float64), 0.0)
         running &= ~game.terminated(obs, actions, next_obs)
         obs = next_obs
         if report is not None:

@@ -83,9 +83,7 @@ class RewardOnly(gym.Env[Any, Any]):
         self.action_space = env.action_space
         self.spec = env.spec
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """See gymnasium.Env."""
         return self._env.reset(seed=seed, options=options)
 
@@ -212,9 +210,7 @@ def _reward_warnings_ignored() -> Iterator[None]:
         yield
 
 
-def _score_goals(
-    job: Job, case: Case, agent: ModelLearningAgent, seconds: float, report: Report | None
-) -> list[Record]:
+def _score_goals(job: Job, case: Case, agent: ModelLearningAgent, seconds: float, report: Report | None) -> list[Record]:
     """Gives the agent one goal after the other and plays each."""
     game = game_of(case)
     policy = as_policy(agent)
@@ -271,9 +267,7 @@ def _train_baseline(job: Job, case: Case, report: Report | None) -> list[Record]
         return float(played.default.mean())
 
     start = time.perf_counter()
-    algorithm, curve = train_baseline(
-        name, case.make_env, steps=job.steps, seed=job.seed, evaluate=evaluate, report=report
-    )
+    algorithm, curve = train_baseline(name, case.make_env, steps=job.steps, seed=job.seed, evaluate=evaluate, report=report)
     seconds = time.perf_counter() - start - evaluating
     deterministic, _ = best_mode(algorithm, evaluate)
     policy = as_policy(algorithm, deterministic=deterministic)

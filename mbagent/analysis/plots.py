@@ -46,9 +46,7 @@ _STYLE: Any = {
 
 def colour_of(agent: str) -> str:
     """The colour of an agent, whatever follows its name after a comma."""
-    return COLOURS.get(agent) or next(
-        (colour for name, colour in COLOURS.items() if agent.startswith(name + ",")), "#555555"
-    )
+    return COLOURS.get(agent) or next((colour for name, colour in COLOURS.items() if agent.startswith(name + ",")), "#555555")
 
 
 def to_png(figure: Figure) -> bytes:
@@ -71,9 +69,7 @@ def draw_scores(results: Sequence[CaseResult]) -> bytes:
                 for row in result.rows:
                     if row.agent == name:
                         x = column + (place - (len(agents) - 1) / 2) * width
-                        _draw_bar(
-                            axes, x, width, row.score.estimate, row.score.low, row.score.high, COLOURS[name]
-                        )
+                        _draw_bar(axes, x, width, row.score.estimate, row.score.low, row.score.high, COLOURS[name])
         _lines_of_the_scale(axes)
         axes.set_xticks(range(len(results)), [result.case.title.replace(", ", "\n") for result in results])
         axes.tick_params(axis="x", length=0)
@@ -84,9 +80,7 @@ def draw_scores(results: Sequence[CaseResult]) -> bytes:
         return to_png(figure)
 
 
-def _draw_bar(
-    axes: Axes, x: float, width: float, height: float, low: float, high: float, colour: str
-) -> None:
+def _draw_bar(axes: Axes, x: float, width: float, height: float, low: float, high: float, colour: str) -> None:
     shown = float(np.clip(height, -0.15, None))
     axes.bar(x, shown, width=0.9 * width, color=colour)
     axes.plot([x, x], [low, high], color="#2b323b", linewidth=1, clip_on=True)

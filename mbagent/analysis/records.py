@@ -91,15 +91,10 @@ def write_records(path: Path, records: Sequence[Record]) -> None:
 def read_records(path: Path) -> list[Record]:
     """Reads what ``write_records`` wrote."""
     rows = json.loads(path.read_text(encoding="utf-8"))
-    return [
-        Record(**{**row, "returns": tuple(row["returns"]), "curve": tuple((s, r) for s, r in row["curve"])})
-        for row in rows
-    ]
+    return [Record(**{**row, "returns": tuple(row["returns"]), "curve": tuple((s, r) for s, r in row["curve"])}) for row in rows]
 
 
-def write_csv(
-    path: Path, records: Sequence[Record], normalise: Mapping[tuple[str, str], tuple[float, float]]
-) -> None:
+def write_csv(path: Path, records: Sequence[Record], normalise: Mapping[tuple[str, str], tuple[float, float]]) -> None:
     """Writes one line for each record.
 
     Args:

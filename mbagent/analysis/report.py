@@ -24,9 +24,7 @@ from mbagent.analysis.summary import CaseResult
 _SHOWN_VERSIONS = ("gymnasium", "stable-baselines3", "torch", "numpy", "numba")
 
 
-def write_report(
-    path: Path, results: Sequence[CaseResult], settings: Settings, *, command: str, minutes: float
-) -> None:
+def write_report(path: Path, results: Sequence[CaseResult], settings: Settings, *, command: str, minutes: float) -> None:
     """Writes the page, pictures and all, into one file.
 
     Args:
@@ -43,9 +41,7 @@ def write_report(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(
-        number=format_number, interval=format_interval, embedded=_embedded, colour=colour_of
-    )
+    environment.filters.update(number=format_number, interval=format_interval, embedded=_embedded, colour=colour_of)
     page = environment.get_template("report.html.jinja").render(
         results=results,
         settings=settings,

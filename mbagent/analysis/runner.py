@@ -104,9 +104,7 @@ def _work(job: Job, folder: Path) -> _Outcome:
 def _line(board: _Board, outcome: _Outcome) -> str:
     means = [f"{r.mean:.2f}" for r in outcome.records if r.goal == "default"]
     scored = f", mean return {means[0]}" if means else ""
-    return f"[{board.done:>3}/{board.total}] {outcome.job.name}{scored} ({outcome.seconds:.0f} s)".replace(
-        "[", r"\[", 1
-    )
+    return f"[{board.done:>3}/{board.total}] {outcome.job.name}{scored} ({outcome.seconds:.0f} s)".replace("[", r"\[", 1)
 
 
 class _Board:

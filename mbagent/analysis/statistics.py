@@ -72,9 +72,7 @@ def interquartile_mean(values: ArrayLike) -> Floats:
     return np.asarray(ordered[..., cut : n - cut].mean(axis=-1))
 
 
-def interquartile_interval(
-    scores: ArrayLike, *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0
-) -> Interval:
+def interquartile_interval(scores: ArrayLike, *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0) -> Interval:
     """Interquartile mean over runs, with a percentile bootstrap interval stratified by run.
 
     Each resample draws runs with replacement and, inside every run drawn, episodes with replacement, so that
@@ -92,9 +90,7 @@ def interquartile_interval(
     """
     matrix = np.asarray(scores, dtype=np.float64)
     if matrix.ndim != 2 or matrix.size == 0:
-        raise ValueError(
-            f"Scores need the shape [runs, episodes] with at least one entry, not {matrix.shape}."
-        )
+        raise ValueError(f"Scores need the shape [runs, episodes] with at least one entry, not {matrix.shape}.")
     if not 0 < confidence < 1:
         raise ValueError(f"The confidence is a probability between 0 and 1, not {confidence}.")
     runs, episodes = matrix.shape

@@ -147,9 +147,7 @@ def _rows(agent: str, records: Sequence[Record], scale: Scale, steps: int) -> li
     return rows
 
 
-def _curves(
-    records: Sequence[Record], scale: Scale
-) -> list[tuple[str, list[tuple[int, float, float, float]]]]:
+def _curves(records: Sequence[Record], scale: Scale) -> list[tuple[str, list[tuple[int, float, float, float]]]]:
     curves = []
     for agent in (AGENT, LEARNED_REWARD, *BASELINES):
         points: dict[int, list[float]] = {}
@@ -161,10 +159,7 @@ def _curves(
                     points.setdefault(steps, []).append(mean)
             elif not r.curve and agent not in BASELINES:
                 points.setdefault(r.steps, []).append(r.mean)
-        scaled = [
-            (steps, normalised(means, scale.random, scale.reference))
-            for steps, means in sorted(points.items())
-        ]
+        scaled = [(steps, normalised(means, scale.random, scale.reference)) for steps, means in sorted(points.items())]
         if len(scaled) > 1:  # a single point is no curve
             curves.append((agent, [(s, float(v.mean()), float(v.min()), float(v.max())) for s, v in scaled]))
     return curves
@@ -173,9 +168,7 @@ def _curves(
 def _goal_rows(case: Case, records: Sequence[Record]) -> list[GoalRow]:
     rows = []
     for goal in all_goals(case)[1:]:
-        learned, true_model = (
-            [r for r in records if r.agent == name and r.goal == goal] for name in (AGENT, TRUE_MODEL)
-        )
+        learned, true_model = ([r for r in records if r.agent == name and r.goal == goal] for name in (AGENT, TRUE_MODEL))
         if not learned or not true_model:
             continue
         scale = _measured(records, goal)

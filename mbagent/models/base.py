@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
-from mbagent_envs.random_keys import derive
 from numpy.typing import NDArray
 
 from mbagent.transitions import TransitionDataset
+from mbagent_envs.random_keys import derive
 
 States: TypeAlias = NDArray[np.int64]
 Actions: TypeAlias = NDArray[np.int64]
@@ -85,9 +85,7 @@ class TransitionModel(Protocol):
     cardinalities: tuple[int, ...]
     n_actions: int
 
-    def fit(
-        self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None
-    ) -> FitReport:
+    def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """Learns from the transitions; rewards are never read. ``progress`` is told the share done, 0 ... 1."""
         ...
 
@@ -153,7 +151,8 @@ class BaseTransitionModel(ABC):
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
         """Next states worth planning for: ``n_samples`` draws a row, equal ones merged.
 
-        All rows share their random numbers, so that two actions, or two states, differ by their effects and not by luck.
+        All rows share their random numbers, so that two actions, or two states, differ by their effects and not by
+        luck.
 
         Args:
             states: int64 [B, F].
@@ -201,9 +200,7 @@ def hash_rows(values: NDArray[Any]) -> NDArray[np.uint64]:
     return derive((mixed * (weights | np.uint64(1))).sum(axis=1, dtype=np.uint64), 1)
 
 
-def merge_draws(
-    rows: NDArray[np.int64], n_rows: int, states: States, terminated: Bools, weights: Floats
-) -> Successors:
+def merge_draws(rows: NDArray[np.int64], n_rows: int, states: States, terminated: Bools, weights: Floats) -> Successors:
     """Adds up the weights of equal (row, state, terminated); each row's order is that of the first draw.
 
     Args:

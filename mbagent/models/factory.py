@@ -38,7 +38,9 @@ def build_paper(space: FactoredSpace, n_actions: int, learning_rate: float) -> T
     """Section 3's two networks as they stand, on flat variables."""
     config = NeuralConfig.paper(len(space))
     return NeuralTransitionModel(
-        space.cardinalities, n_actions, replace(config, training=replace(config.training, learning_rate=learning_rate))
+        space.cardinalities,
+        n_actions,
+        replace(config, training=replace(config.training, learning_rate=learning_rate)),
     )
 
 

@@ -1,7 +1,9 @@
-"""Compiled inference: the networks of ``networks.py`` evaluated row by row (the samplers made of them: ``samplers.py``).
+"""Compiled inference: the networks of ``networks.py`` evaluated row by row (``samplers.py`` draws with them).
 
-Torch trains; here each row is computed by itself, in one fixed order of operations. So a row's result is the same to the
-last bit alone and in any batch, which matrix products do not promise, and inputs that are 0 cost nothing. Shapes: B batch, F
+Torch trains; here each row is computed by itself, in one fixed order of operations. So a row's result is the same to
+the
+last bit alone and in any batch, which matrix products do not promise, and inputs that are 0 cost nothing. Shapes: B
+batch, F
 state factors, O = F + 1 output factors, K largest cardinality, G hidden nodes in a group.
 """
 
@@ -11,8 +13,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from mbagent_envs._compiled import compiled
 from numpy.typing import NDArray
+
+from mbagent_envs._compiled import compiled
 
 Floats32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -164,6 +167,7 @@ def dense_logits(states: Ints, actions: Ints, layout: Layout, dense: DenseWeight
 
 @compiled
 def softmax(logits: Floats32, n: int, out: Floats) -> None:
+    """Writes the distribution of a factor with ``n`` values to ``out`` [K], from its logits [K]."""
     if n == 2:  # one exponential instead of two: bits are the common case
         difference = np.float64(logits[1]) - np.float64(logits[0])
         small = math.exp(-abs(difference))
@@ -215,7 +219,8 @@ def conditional(
 ) -> None:
     """Writes P(y_i | s, a, y_<i) to ``out``, for a factor that has a group.
 
-    ``base`` [K] are the predictor's logits, ``factors`` [O] holds y_<i, ``hidden`` [G] and ``logits`` [K] are work space.
+    ``base`` [K] are the predictor's logits, ``factors`` [O] holds y_<i, ``hidden`` [G] and ``logits`` [K] are work
+    space.
     """
     g = group.group_of[i]
     hidden[:] = group.bias[g]
@@ -231,7 +236,13 @@ def conditional(
 
 @compiled
 def finish(
-    i: int, base: Floats32, layout: Layout, group: GroupWeights, hidden: Floats32, logits: Floats32, out: Floats
+    i: int,
+    base: Floats32,
+    layout: Layout,
+    group: GroupWeights,
+    hidden: Floats32,
+    logits: Floats32,
+    out: Floats,
 ) -> None:
     """From the summed input of factor i's group (overwritten) to the factor's distribution."""
     n, g = layout.outputs[i], group.group_of[i]

@@ -1,6 +1,7 @@
 """The two networks of the paper's section 3: the predictor (3.1) and the conditioner with grouped hidden nodes (3.2).
 
-The paper's variables are bits; here a variable is a *factor* with any number of values (a bit is a factor with two), and
+The paper's variables are bits; here a variable is a *factor* with any number of values (a bit is a factor with two),
+and
 termination is one more output factor, the last. Shapes: B batch, F state factors, O = F + 1 output factors, K largest
 cardinality, G hidden nodes in a group.
 """
@@ -121,7 +122,12 @@ class Affine(nn.Module):
     """
 
     def __init__(
-        self, n_in: int, n_out: int, generator: torch.Generator, mask: Tensor | None = None, fan_in: int | None = None
+        self,
+        n_in: int,
+        n_out: int,
+        generator: torch.Generator,
+        mask: Tensor | None = None,
+        fan_in: int | None = None,
     ) -> None:
         super().__init__()
         bound = 1.0 / math.sqrt(max(1, fan_in or n_in))
@@ -213,8 +219,10 @@ class DensePredictor(nn.Module):
 class Conditioner(nn.Module):
     """The conditioner network (paper 3.2): output i is the distribution of y_i given (s, a) and other next factors.
 
-    One hidden layer in groups, one group an output. Group i sees (s, a) and, of the next factors, y_<i (mask "causal") or all
-    but y_i (mask "others"); output i reads group i and nothing else, so nothing of y_i reaches output i. Outputs that the
+    One hidden layer in groups, one group an output. Group i sees (s, a) and, of the next factors, y_<i (mask
+    "causal") or all
+    but y_i (mask "others"); output i reads group i and nothing else, so nothing of y_i reaches output i. Outputs
+    that the
     predictor leaves no doubt about need no group: their logits are 0 here, and nothing is added to the predictor's.
 
     Args:
@@ -222,7 +230,8 @@ class Conditioner(nn.Module):
         mask: what a group sees.
         group_size: hidden nodes G in a group (the paper: 2d, of 2d^2 + 1 in all).
         activation: of the hidden nodes.
-        correction: outputs start at zero, since they are added to the predictor's logits; False: they stand alone (the paper).
+        correction: outputs start at zero, since they are added to the predictor's logits; False: they stand alone
+            (the paper).
         dropout: share of hidden nodes zeroed in each training step.
         grouped: bool [O], which outputs have a group; None: all. Needs ``correction``.
         generator: source of the first weights.

@@ -34,6 +34,7 @@ from mbagent.transitions import TransitionDataset
 BodyFactory: TypeAlias = Callable[[FactorCodec, torch.Generator], nn.Module]
 """Builds a predictor body (see ``networks.Predictor``); all its first weights must come from the generator."""
 
+
 class NeuralTransitionModel(BaseTransitionModel):
     """A predictor network, alone or with a conditioner network.
 
@@ -94,12 +95,11 @@ class NeuralTransitionModel(BaseTransitionModel):
         self._forward: CompiledBody | None = None
         self._groups: GroupWeights | None = None
 
-    def fit(
-        self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None
-    ) -> FitReport:
+    def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel; fits anew from first weights that depend on ``seed`` only.
 
-        The predictor is fitted first; then the conditioner, with groups for those factors that the predictor leaves open.
+        The predictor is fitted first; then the conditioner, with groups for those factors that the predictor leaves
+        open.
         """
         began = time.perf_counter()
         self._build(seed)
@@ -138,7 +138,15 @@ class NeuralTransitionModel(BaseTransitionModel):
         if self.config.conditioner == "causal":
             keys = np.zeros(len(states), dtype=np.uint64)
             likeliest = sample_causal(
-                states, actions, logits, probs, keys, self._layout, self._packed_groups(), self.config.certain, True
+                states,
+                actions,
+                logits,
+                probs,
+                keys,
+                self._layout,
+                self._packed_groups(),
+                self.config.certain,
+                True,
             )
         weights = rows.weights.numpy()
         return float(np.average((likeliest == outcomes).all(axis=1), weights=weights)) if len(weights) else 1.0
@@ -165,7 +173,15 @@ class NeuralTransitionModel(BaseTransitionModel):
             factors = sample_independent(probs, self._layout.outputs, keys)
         elif config.conditioner == "causal":
             factors = sample_causal(
-                states, actions, logits, probs, keys, self._layout, self._packed_groups(), config.certain, False
+                states,
+                actions,
+                logits,
+                probs,
+                keys,
+                self._layout,
+                self._packed_groups(),
+                config.certain,
+                False,
             )
         else:
             factors = sample_sweeps(
@@ -189,7 +205,7 @@ class NeuralTransitionModel(BaseTransitionModel):
         return probs[:, possible]
 
     def probabilities(self, states: States, actions: Actions) -> Floats:
-        """The predictor's output for every factor and ``terminated``, the last: float64 [B, O, K], 0 where a factor lacks a value."""
+        """The predictor's output for every factor, ``terminated`` last: float64 [B, O, K], 0 where a factor lacks a value."""
         return self._predict(*_rows(states, actions))[1]
 
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
@@ -205,9 +221,7 @@ class NeuralTransitionModel(BaseTransitionModel):
         if self.config.conditioner is None:
             with np.errstate(divide="ignore"):
                 return np.log(np.take_along_axis(probs, outcomes[:, :, None], axis=2)[:, :, 0]).sum(axis=1)
-        return log_prob_causal(
-            states, actions, outcomes, logits, probs, self._layout, self._packed_groups(), self.config.certain
-        )
+        return log_prob_causal(states, actions, outcomes, logits, probs, self._layout, self._packed_groups(), self.config.certain)
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
         """See TransitionModel; systematic draws where probabilities are exact (``systematic.py``), else plain draws."""

@@ -10,7 +10,14 @@ import torch
 from torch import Tensor, nn
 
 from mbagent.models.base import Actions, States
-from mbagent.models.kernels import ACTIVATION_CODES, DenseWeights, Floats32, GroupWeights, Layout, dense_logits
+from mbagent.models.kernels import (
+    ACTIVATION_CODES,
+    DenseWeights,
+    Floats32,
+    GroupWeights,
+    Layout,
+    dense_logits,
+)
 from mbagent.models.networks import Conditioner, DensePredictor, FactorCodec
 from mbagent.models.plane_kernels import pack_planes, plane_logits
 from mbagent.models.planes import PlanePredictor
@@ -19,7 +26,8 @@ CompiledBody: TypeAlias = Callable[[States, Actions], Floats32]
 """(states int64 [B, F], actions int64 [B]) -> logits float32 [B, O, K]; a row's result does not depend on its batch."""
 
 CHUNK = 64
-"""Rows that other torch bodies are evaluated on at once, always this many: matrix products round differently in other sizes."""
+"""Rows that other torch bodies are evaluated on at once, always this many: matrix products round differently in
+other sizes."""
 
 
 def compiled_body(predictor: nn.Module, layout: Layout) -> CompiledBody:

@@ -1,6 +1,7 @@
 """The plane predictor (``planes.py``) compiled: torch trains, numba samples.
 
-Rows are worked on in blocks of one fixed size, so a row's result does not depend on the rows beside it. Shapes: C' input channels (planes, or
+Rows are worked on in blocks of one fixed size, so a row's result does not depend on the rows beside it. Shapes: C'
+input channels (planes, or
 planes times values), H rows, W columns, D hidden channels, A actions.
 """
 
@@ -10,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from mbagent_envs._compiled import compiled
 from numpy.typing import NDArray
 
 from mbagent.models.planes import PlanePredictor
+from mbagent_envs._compiled import compiled
 
 Floats32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -130,10 +131,7 @@ def plane_logits(states: Ints, actions: Ints, w: PlaneWeights, width: int) -> Fl
 @compiled
 def _same(states: Ints, b: int) -> bool:
     """Whether row b is the state of the row before it: its first layer is then known but for the action."""
-    for f in range(states.shape[1]):
-        if states[b, f] != states[b - 1, f]:
-            return False
-    return True
+    return bool((states[b] == states[b - 1]).all())
 
 
 @compiled
@@ -206,9 +204,7 @@ def _activate_second(above: Floats32, bias: Floats32, top: Floats32) -> None:
 
 
 @compiled
-def _read_out(
-    state: Ints, w: PlaneWeights, read: Floats32, out_bias: Floats32, columns: int, logits: Floats32
-) -> None:
+def _read_out(state: Ints, w: PlaneWeights, read: Floats32, out_bias: Floats32, columns: int, logits: Floats32) -> None:
     for f in range(len(state)):
         position, first = w.row[f] * columns + w.column[f], w.channel[f]
         for k in range(w.values):

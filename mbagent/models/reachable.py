@@ -13,7 +13,7 @@ from mbagent.models.state_graph import StateGraph
 
 @dataclass(frozen=True)
 class ReachableMDP:
-    """States, and for each (state, action) the successors with probability and terminated. Rewards stay with the planner.
+    """States, and for each (state, action) the successors with probability and terminated; no rewards.
 
     Attributes:
         states: int64 [N, F], the start states first.

@@ -9,8 +9,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from mbagent_envs._compiled import compiled
-from mbagent_envs.random_keys import derive_one, uniform_at
 from numpy.typing import NDArray
 
 from mbagent.models.kernels import (
@@ -25,6 +23,8 @@ from mbagent.models.kernels import (
     largest,
     trusted,
 )
+from mbagent_envs._compiled import compiled
+from mbagent_envs.random_keys import derive_one, uniform_at
 
 Keys = NDArray[np.uint64]
 
@@ -67,10 +67,12 @@ def sample_causal(
     certain: float,
     greedy: bool,
 ) -> Ints:
-    """Ancestral draws int64 [B, O]: y_0, then y_1 given it, and so on; ``greedy`` takes the likeliest each time instead.
+    """Ancestral draws int64 [B, O]: y_0, then y_1 given it, and so on; ``greedy`` takes the likeliest instead.
 
-    A factor whose likeliest value has at least ``certain`` in the predictor's eyes, or that has no group in the conditioner,
-    is drawn from the predictor. This is part of the model: ``log_prob_causal`` follows the same rule, so both stay exact.
+    A factor whose likeliest value has at least ``certain`` in the predictor's eyes, or that has no group in the
+    conditioner,
+    is drawn from the predictor. This is part of the model: ``log_prob_causal`` follows the same rule, so both stay
+    exact.
     """
     n_outputs = len(layout.outputs)
     factors = np.empty((len(states), n_outputs), dtype=np.int64)

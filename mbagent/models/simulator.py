@@ -6,8 +6,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from mbagent_envs import Game
-from mbagent_envs.random_keys import derive
 from numpy.typing import NDArray
 
 from mbagent.models.base import (
@@ -24,6 +22,8 @@ from mbagent.models.base import (
 from mbagent.models.systematic import thin
 from mbagent.spaces import FactoredSpace
 from mbagent.transitions import TransitionDataset
+from mbagent_envs import Game
+from mbagent_envs.random_keys import derive
 
 
 class SimulatorModel(BaseTransitionModel):
@@ -39,9 +39,7 @@ class SimulatorModel(BaseTransitionModel):
         super().__init__(self.space.cardinalities, int(game.action_space.n))
         self._shape = game.observation_space.shape
 
-    def fit(
-        self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None
-    ) -> FitReport:
+    def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """Does nothing: the rules are known."""
         if progress is not None:
             progress(1.0)

@@ -8,10 +8,10 @@ depend on which other observations are planned for in the same batch.
 from __future__ import annotations
 
 import numpy as np
-from mbagent_envs.random_keys import derive
 from numpy.typing import NDArray
 
 from mbagent.models.base import Bools, Floats, States, Successors, TransitionModel, hash_rows
+from mbagent_envs.random_keys import derive
 
 Indices = NDArray[np.int64]
 
@@ -65,7 +65,8 @@ class StateGraph:
         """The filled part of the array ``name``."""
         for table in (self.__dict__.get("_nodes"), self.__dict__.get("_edges")):
             if table is not None and name in table.arrays:
-                return table.view(name)
+                view: NDArray[np.generic] = table.view(name)
+                return view
         raise AttributeError(name)
 
     states: States
@@ -85,7 +86,7 @@ class StateGraph:
         _, first, inverse = np.unique(tags, return_index=True, return_inverse=True)
         order = np.argsort(first, kind="stable")
         nodes = np.empty(len(first), dtype=np.int64)
-        fresh = []
+        fresh: list[int] = []
         size = len(self)
         for unique in order:
             tag = int(tags[first[unique]])

@@ -1,11 +1,15 @@
 """Successors for planning: systematic draws through the ancestral inverse distribution function, equal ones merged.
 
-A row starts as one *particle* that holds the n grid points (j + offset) / n of [0, 1). At each factor the particle's interval
+A row starts as one *particle* that holds the n grid points (j + offset) / n of [0, 1). At each factor the particle's
+interval
 is split in proportion to P(y_i | s, a, y_<i) and its points go to the parts; parts without a point are dropped. So work
 grows with the number of different outcomes and not with n, no outcome of probability 1 / n or more is missed, and an
-outcome's share of the points is within 1 / n of its probability. The offset is the same for all rows: two actions, or two
-states, differ by their effects and not by luck. A particle down to a single point goes on with fresh numbers, hashed from
-(seed, point, factor), for its interval would soon be too narrow for a float. Shapes: B batch, F state factors, O = F + 1
+outcome's share of the points is within 1 / n of its probability. The offset is the same for all rows: two actions,
+or two
+states, differ by their effects and not by luck. A particle down to a single point goes on with fresh numbers, hashed
+from
+(seed, point, factor), for its interval would soon be too narrow for a float. Shapes: B batch, F state factors, O = F
++ 1
 output factors, K largest cardinality, n points a row, M successors.
 """
 
@@ -16,9 +20,6 @@ from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from mbagent_envs._compiled import compiled
-from mbagent_envs.random_keys import derive, derive_one, uniform_at, uniforms
-from numpy.typing import NDArray
 
 from mbagent.models.base import Successors
 from mbagent.models.kernels import (
@@ -33,9 +34,12 @@ from mbagent.models.kernels import (
     trusted,
 )
 from mbagent.models.samplers import draw
+from mbagent_envs._compiled import compiled
+from mbagent_envs.random_keys import derive, derive_one, uniform_at, uniforms
 
 NEGLIGIBLE = 0.01
-"""Probabilities under this share of the factor's largest count as 0 here: noise of the fit, which planners would exploit."""
+"""Probabilities under this share of the factor's largest count as 0 here: noise of the fit, which planners would
+exploit."""
 
 FOUND = 0.95
 """When the outcomes found hold this share of a row's mass, they are weighted by exact probability, else by points."""
@@ -44,7 +48,8 @@ CHUNK = 2048
 """Rows worked on at once; bounds the memory."""
 
 Conditional: TypeAlias = Callable[[int, Ints, Ints], Floats]
-"""(factor i, row of each particle [P], its outcome so far [P, O]) -> P(y_i | s, a, y_<i), float64 [P, cardinality of i]."""
+"""(factor i, row of each particle [P], its outcome so far [P, O]) -> P(y_i | s, a, y_<i), float64 [P, cardinality of
+i]."""
 
 _Found: TypeAlias = tuple[Ints, Ints, Floats, Ints]
 """Counts of outcomes [B], outcomes [M, O], their probabilities [M], their points [M]."""
@@ -90,7 +95,15 @@ def _prune(values: Floats, n: int, out: Floats) -> None:
 
 @compiled
 def _split(
-    p: _Particles, q: int, n_live: int, i: int, values: Floats, n: int, n_grid: int, key: np.uint64, offset: float
+    p: _Particles,
+    q: int,
+    n_live: int,
+    i: int,
+    values: Floats,
+    n: int,
+    n_grid: int,
+    key: np.uint64,
+    offset: float,
 ) -> int:
     """Shares the points of particle ``q`` among the values of factor i; new particles are appended; returns how many live."""
     if p.points[q] == 1:
@@ -133,9 +146,7 @@ def _begin(p: _Particles, n_grid: int) -> int:
 def _new_particles(n_grid: int, n_outputs: int) -> _Particles:
     ends = np.empty((3, n_grid), dtype=np.float64)
     counts = np.empty((2, n_grid), dtype=np.int64)
-    return _Particles(
-        counts[0], counts[1], ends[0], ends[1], ends[2], np.empty((n_grid, n_outputs), dtype=np.int64)
-    )
+    return _Particles(counts[0], counts[1], ends[0], ends[1], ends[2], np.empty((n_grid, n_outputs), dtype=np.int64))
 
 
 @compiled
@@ -214,7 +225,18 @@ def _causal(
                 if trust:
                     values[:] = probs[b, i]
                 else:
-                    conditional(i, logits[b, i], active, n_active, p.factors[q], layout, group, hidden, row_logits, values)
+                    conditional(
+                        i,
+                        logits[b, i],
+                        active,
+                        n_active,
+                        p.factors[q],
+                        layout,
+                        group,
+                        hidden,
+                        row_logits,
+                        values,
+                    )
                 _prune(values, n, values)
                 n_live = _split(p, q, n_live, i, values, n, n_grid, key, offset)
         counts[b] = n_live
@@ -236,9 +258,7 @@ def independent_successors(probs: Floats, outputs: Ints, n_samples: int, seed: i
     """
     key, offset = start(seed)
     step = _rows_at_once(n_samples, len(outputs))
-    parts = [
-        _independent(probs[b : b + step], outputs, n_samples, key, offset) for b in range(0, len(probs), step)
-    ]
+    parts = [_independent(probs[b : b + step], outputs, n_samples, key, offset) for b in range(0, len(probs), step)]
     return assemble(parts, n_samples, len(outputs))
 
 
@@ -261,7 +281,16 @@ def causal_successors(
         rows = slice(b, b + step)
         parts.append(
             _causal(
-                states[rows], actions[rows], logits[rows], probs[rows], layout, group, certain, n_samples, key, offset
+                states[rows],
+                actions[rows],
+                logits[rows],
+                probs[rows],
+                layout,
+                group,
+                certain,
+                n_samples,
+                key,
+                offset,
             )
         )
     return assemble(parts, n_samples, len(layout.outputs))

@@ -39,7 +39,8 @@ class TrainingConfig:
         checks: how often the held-out loss is looked at; the best weights seen are kept.
         patience: stop after this many checks without a better held-out loss.
         loss: "cross_entropy", or "squared" as in the paper.
-        negligible: a factor whose held-out cross-entropy under the predictor is below this many nats gets no group in the
+        negligible: a factor whose held-out cross-entropy under the predictor is below this many nats gets no group
+            in the
             conditioner.
         online_learning_rate: Adam's, in the on-line method.
     """
@@ -127,7 +128,8 @@ def losses(codec: FactorCodec, logits: Tensor, outcomes: Tensor, loss: Loss) -> 
 class Trainer:
     """Fits a predictor and then a conditioner to examples, or both to one observation after another.
 
-    The conditioner's loss never reaches the predictor, so the order does not matter to the predictor; a conditioner that
+    The conditioner's loss never reaches the predictor, so the order does not matter to the predictor; a conditioner
+    that
     corrects a finished predictor has a fixed thing to correct.
 
     Args:
@@ -138,7 +140,11 @@ class Trainer:
     """
 
     def __init__(
-        self, codec: FactorCodec, predictor: nn.Module, conditioner: Conditioner | None, config: TrainingConfig
+        self,
+        codec: FactorCodec,
+        predictor: nn.Module,
+        conditioner: Conditioner | None,
+        config: TrainingConfig,
     ) -> None:
         self.codec = codec
         self.predictor = predictor
@@ -159,9 +165,7 @@ class Trainer:
             logits = logits + base
         return losses(self.codec, logits, batch.outcomes, loss)
 
-    def fit(
-        self, train: Examples, held_out: Examples, generator: torch.Generator, progress: Progress | None
-    ) -> float:
+    def fit(self, train: Examples, held_out: Examples, generator: torch.Generator, progress: Progress | None) -> float:
         """Fits the predictor; leaves its best weights in place; returns epochs done."""
         return self._run(self.predictor, self.predictor_losses, train, held_out, generator, progress)
 
@@ -239,7 +243,10 @@ class Trainer:
         return done / per_epoch
 
     def _adamw(self, module: nn.Module) -> torch.optim.AdamW:
-        decayed = {"params": [p for p in module.parameters() if p.ndim > 1], "weight_decay": self.config.weight_decay}
+        decayed = {
+            "params": [p for p in module.parameters() if p.ndim > 1],
+            "weight_decay": self.config.weight_decay,
+        }
         free = {"params": [p for p in module.parameters() if p.ndim <= 1], "weight_decay": 0.0}
         return torch.optim.AdamW([decayed, free], lr=self.config.learning_rate, fused=True)
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from mbagent_envs.random_keys import derive
 
 from mbagent.models.base import States, TransitionModel
 from mbagent.planning.goal import Goal
 from mbagent.planning.planner import Plan, PlannerSettings, best_actions
 from mbagent.planning.rollouts import random_returns
+from mbagent_envs.random_keys import derive
 
 
 class FlatMonteCarlo:

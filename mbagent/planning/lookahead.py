@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from mbagent_envs.random_keys import derive
 from numpy.typing import NDArray
 
 from mbagent.models.state_graph import StateGraph
+from mbagent_envs.random_keys import derive
 
 LAYER_WIDTH = 32
 """Draws for a (state, action) are chosen so that a layer's states times draws stay about this many."""
@@ -17,9 +17,7 @@ def layer_seed(seed: int, depth: int) -> int:
     return int(derive(seed, depth)[0])
 
 
-def grow_lookahead(
-    graph: StateGraph, roots: NDArray[np.int64], max_states: int, n_samples: int, horizon: int, seed: int
-) -> None:
+def grow_lookahead(graph: StateGraph, roots: NDArray[np.int64], max_states: int, n_samples: int, horizon: int, seed: int) -> None:
     """Expands the graph breadth-first around every root, each in its own group, until a budget a root is used up.
 
     The draws for each (state, action) shrink from ``n_samples`` near the root to one further on, so that the budget

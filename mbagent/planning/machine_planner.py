@@ -67,7 +67,12 @@ class MachinePlanner:
         graph, settings = StateGraph(self._known_model()), self.settings
         nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
         grow_lookahead(
-            graph, nodes, settings.lookahead_states, settings.lookahead_samples, settings.horizon, settings.seed
+            graph,
+            nodes,
+            settings.lookahead_states,
+            settings.lookahead_samples,
+            settings.horizon,
+            settings.seed,
         )
         return graph, solve(graph, self._known_goal(), settings.gamma, n_groups=len(roots)), nodes
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from mbagent_envs.random_keys import derive
 
 from mbagent.models.base import Floats, States
 from mbagent.models.state_graph import StateGraph
@@ -13,6 +12,7 @@ from mbagent.planning.planner import Plan, best_actions
 from mbagent.planning.rollouts import random_returns
 from mbagent.planning.tree import Ints, Paths, back_up_max, back_up_mean, empty_paths, initialise, select
 from mbagent.planning.value_iteration import Values, score_edges, settle
+from mbagent_envs.random_keys import derive
 
 FINAL_SWEEPS = 100
 """Sweeps of value iteration, at most, that settle the grown graph after the last simulation."""
@@ -47,9 +47,7 @@ class MctsPlanner(MachinePlanner):
         values, visits, scores = self._search(graph, solution, nodes, shared=False)
         return Plan(best_actions(scores), values, visits)
 
-    def _search(
-        self, graph: StateGraph, solution: Values, nodes: Ints, shared: bool
-    ) -> tuple[Floats, Floats, Floats]:
+    def _search(self, graph: StateGraph, solution: Values, nodes: Ints, shared: bool) -> tuple[Floats, Floats, Floats]:
         if not shared:
             return _Search(self, graph, solution, nodes).run()
         # Roots within one shared machine: each searches on its own copy of the values.
@@ -66,9 +64,7 @@ class _Search:
         self.settings = planner.settings
         self.rollouts = self.settings.leaf_values == "rollouts"
         self.prior = 0.0 if self.rollouts else self.settings.prior_visits
-        self.solution = Values(
-            solution.v.copy(), solution.q.copy(), solution.rewards, solution.frontier.copy()
-        )
+        self.solution = Values(solution.v.copy(), solution.q.copy(), solution.rewards, solution.frontier.copy())
         self.root_visits = np.zeros((len(roots), graph.model.n_actions))
         self.visits, self.counted = np.zeros_like(solution.q), np.zeros_like(solution.q)
         spread = solution.v[roots]
@@ -135,9 +131,7 @@ class _Search:
         fresh = graph.expand(leaves, draws, int(derive(self.settings.seed, _SEARCH_SALT, done + 1)[0]))
         solution.rewards = np.concatenate([solution.rewards, score_edges(graph, self.planner._known_goal(), n_edges)])
         room = np.zeros((len(fresh), graph.model.n_actions))
-        solution.q, self.visits, self.counted = (
-            np.concatenate([x, room]) for x in (solution.q, self.visits, self.counted)
-        )
+        solution.q, self.visits, self.counted = (np.concatenate([x, room]) for x in (solution.q, self.visits, self.counted))
         solution.v = np.concatenate([solution.v, solution.frontier[graph.groups[fresh]]])
         if self.rollouts:
             return

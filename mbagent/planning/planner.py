@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from numpy.typing import NDArray
-
 from mbagent.models.base import Actions, Floats, States, TransitionModel
 from mbagent.planning.goal import Goal
 
@@ -52,7 +50,15 @@ class PlannerSettings:
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
-        for name in ("num_simulations", "horizon", "max_states", "lookahead_states", "n_samples", "lookahead_samples", "wave"):
+        for name in (
+            "num_simulations",
+            "horizon",
+            "max_states",
+            "lookahead_states",
+            "n_samples",
+            "lookahead_samples",
+            "wave",
+        ):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")
@@ -60,7 +66,11 @@ class PlannerSettings:
             raise ValueError(f"gamma must lie between 0 and 1, both excluded, got {self.gamma!r}.")
         if self.c_uct < 0.0 or self.prior_visits < 0.0:
             raise ValueError("c_uct and prior_visits must not be negative.")
-        choices = {"leaf_values": ("machine", "rollouts"), "backup": ("max", "mean"), "choice": ("mean", "greatest")}
+        choices = {
+            "leaf_values": ("machine", "rollouts"),
+            "backup": ("max", "mean"),
+            "choice": ("mean", "greatest"),
+        }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} must be one of {allowed}, got {getattr(self, name)!r}.")
@@ -86,6 +96,10 @@ class Plan:
 class Planner(Protocol):
     """Chooses actions by imagining with a model; the outcome is a pure function of (settings, model, goal, root)."""
 
+    def __init__(self, settings: PlannerSettings) -> None:
+        """Takes the settings; a model and a goal must follow."""
+        ...
+
     def set_model(self, model: TransitionModel, start_states: States) -> None:
         """Takes a (newly fitted) model and the start states int64 [S, F] seen; every cache is dropped."""
         ...
@@ -99,7 +113,7 @@ class Planner(Protocol):
         ...
 
 
-def best_actions(scores: NDArray[Floats] | Floats) -> Actions:
+def best_actions(scores: Floats) -> Actions:
     """The first action [B] whose score [B, A] is the greatest but for rounding errors."""
     top = scores.max(axis=1, keepdims=True)
     slack = 1e-9 * abs(scores).max(axis=1, keepdims=True)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from mbagent_envs.random_keys import derive, uniforms
 
 from mbagent.models.base import Actions, Floats, Keys, States, TransitionModel
 from mbagent.planning.goal import Goal
+from mbagent_envs.random_keys import derive, uniforms
 
 
 def random_returns(

@@ -1,7 +1,8 @@
 """The search tree and its compiled kernels: select, expand, back up.
 
 The "tree" is a graph: a state reached in two ways is one node (a transposition). Every (node, action) keeps several
-sampled successors, as a stochastic world needs. Shapes: R roots, W simulations of a wave, H horizon, N nodes, A actions,
+sampled successors, as a stochastic world needs. Shapes: R roots, W simulations of a wave, H horizon, N nodes, A
+actions,
 M successor edges.
 """
 
@@ -10,11 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from mbagent_envs._compiled import compiled
-from mbagent_envs.random_keys import uniform_at
 from numpy.typing import NDArray
 
 from mbagent.models.base import Bools, Floats
+from mbagent_envs._compiled import compiled
+from mbagent_envs.random_keys import uniform_at
 
 Ints = NDArray[np.int64]
 

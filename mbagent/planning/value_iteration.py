@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from mbagent_envs._compiled import compiled
 from numpy.typing import NDArray
 
 from mbagent.models.base import Bools, Floats, States, TransitionModel
 from mbagent.models.reachable import grow_reachable
 from mbagent.models.state_graph import StateGraph
 from mbagent.planning.goal import Goal
+from mbagent_envs._compiled import compiled
 
 TOLERANCE = 1e-7
 """Sweeps stop when no value moves by more than this share of the largest reward."""
@@ -62,10 +62,10 @@ def solve(graph: StateGraph, goal: Goal, gamma: float, n_groups: int = 1) -> Val
     return values
 
 
-def settle(
-    graph: StateGraph, values: Values, gamma: float, max_sweeps: int = MAX_SWEEPS, only: Bools | None = None
-) -> None:
-    """Value iteration from the given values on, in place (Gauss-Seidel, last node first: without cycles one sweep does).
+def settle(graph: StateGraph, values: Values, gamma: float, max_sweeps: int = MAX_SWEEPS, only: Bools | None = None) -> None:
+    """Value iteration from the given values on, in place.
+
+    Gauss-Seidel, the last node first: on a graph without cycles one sweep does.
 
     Args:
         graph: what was imagined.
@@ -75,7 +75,8 @@ def settle(
         only: bool [G], the groups to work on; None for all.
     """
     flat = graph.sources * graph.model.n_actions + graph.actions
-    mean_rewards = np.bincount(flat, weights=values.rewards * graph.probabilities, minlength=values.q.size)
+    weights = values.rewards * graph.probabilities
+    mean_rewards: Floats = np.bincount(flat, weights=weights, minlength=values.q.size).astype(np.float64, copy=False)
     _sweep(
         graph.groups,
         graph.expanded,
@@ -95,7 +96,7 @@ def settle(
 
 
 @compiled
-def _sweep(
+def _sweep(  # noqa: C901 - one kernel: splitting it would hide the order of the sweep
     groups: NDArray[np.int64],
     expanded: NDArray[np.bool_],
     first: NDArray[np.int64],

@@ -99,7 +99,13 @@ def test_the_file_holds_json_and_plain_arrays_only(agent: ModelLearningAgent) ->
     with zipfile.ZipFile(buffer) as archive:
         assert json.loads(archive.read("data"))["policy_class"] == "MctsPolicy"
         for name in archive.namelist():
-            assert name in {"data", "policy.npz", "planning.npz", "_stable_baselines3_version", "system_info.txt"}
+            assert name in {
+                "data",
+                "policy.npz",
+                "planning.npz",
+                "_stable_baselines3_version",
+                "system_info.txt",
+            }
             if name.endswith(".npz"):
                 with np.load(io.BytesIO(archive.read(name)), allow_pickle=False) as arrays:
                     assert all(arrays[key].dtype != object for key in arrays.files)

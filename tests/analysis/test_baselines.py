@@ -15,9 +15,7 @@ def score(policy: Policy, repeatable: bool) -> float:
 @pytest.mark.parametrize("name", ["PPO", "DQN", "A2C"])
 def test_baselines_use_exactly_the_steps_they_are_given(name: BaselineName) -> None:
     reports: list[float] = []
-    algorithm, curve = train_baseline(
-        name, CASE.make_env, steps=2000, seed=0, evaluate=score, points=2, report=reports.append
-    )
+    algorithm, curve = train_baseline(name, CASE.make_env, steps=2000, seed=0, evaluate=score, points=2, report=reports.append)
     assert algorithm.num_timesteps == 2000
     assert [steps for steps, _ in curve] == [0, 1000, 2000]
     assert all(0 <= share <= 1 for share in reports)

@@ -105,9 +105,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, monkeypatch
         run(replace(settings, steps=7), tmp_path, workers=1, console=quiet(), resume=True)
 
 
-def test_a_failing_job_is_named_and_the_others_are_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failing_job_is_named_and_the_others_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     good, bad = (Job(RANDOM, "geyser_low_cost", seed, 0, 2) for seed in (0, 1))
 
     def sometimes(job: Job, report: Any) -> list[Record]:
@@ -116,9 +114,7 @@ def test_a_failing_job_is_named_and_the_others_are_kept(
         return run_job(job, report)
 
     monkeypatch.setattr("mbagent.analysis.runner.run_job", sometimes)
-    with pytest.raises(
-        JobsFailedError, match=r"1 of 2 jobs failed(.|\n)*seed 1: ZeroDivisionError: too small"
-    ):
+    with pytest.raises(JobsFailedError, match=r"1 of 2 jobs failed(.|\n)*seed 1: ZeroDivisionError: too small"):
         run_jobs([bad, good], tmp_path, workers=1, console=quiet())
     assert (tmp_path / good.file_name).exists()
     assert "Traceback" in (tmp_path / "errors.log").read_text(encoding="utf-8")

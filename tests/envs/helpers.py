@@ -66,9 +66,7 @@ class Lottery(Game):
     def reward(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
         return as_floats(self.prize * next_obs[:, 2])
 
-    def terminated(
-        self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]
-    ) -> Bools:
+    def terminated(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Bools:
         return np.asarray(next_obs[:, 2] == 1)
 
     def invalid(self, obs: Bits) -> str | None:

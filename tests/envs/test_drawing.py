@@ -56,9 +56,7 @@ def test_the_player_is_where_the_observation_says() -> None:
             player = next(s for s in scene.sprites if s.kind.startswith("player"))
             coral = np.argwhere(np.abs(draw_rgb(scene).astype(int) - (240, 100, 73)).max(axis=2) < 12)
             cell = cell_pixels(scene)
-            np.testing.assert_allclose(
-                coral.mean(axis=0) / cell, (player.row + 0.5, player.column + 0.5), atol=0.2
-            )
+            np.testing.assert_allclose(coral.mean(axis=0) / cell, (player.row + 0.5, player.column + 0.5), atol=0.2)
 
 
 def test_large_boards_stay_of_a_size_for_screens() -> None:

@@ -31,9 +31,7 @@ def no_screen(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @each_variant
 @pytest.mark.parametrize("render_mode", [None, "rgb_array", "ansi"])
-def test_gymnasium_and_sb3_find_nothing_to_say(
-    env_id: str, arguments: dict[str, Any], render_mode: str | None
-) -> None:
+def test_gymnasium_and_sb3_find_nothing_to_say(env_id: str, arguments: dict[str, Any], render_mode: str | None) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env = gym.make(env_id, render_mode=render_mode, **arguments)
@@ -68,10 +66,7 @@ def test_an_episode_follows_from_its_key(env_id: str, arguments: dict[str, Any])
         expected = game.transition(obs[None], np.array([action]), derive(key, t))
         next_obs, reward, terminated, truncated, info = env.step(action)
         np.testing.assert_array_equal(next_obs, expected[0])
-        assert (
-            reward
-            == inner.reward_fn(obs[None].astype(np.int64), np.array([action]), expected.astype(np.int64))[0]
-        )
+        assert reward == inner.reward_fn(obs[None].astype(np.int64), np.array([action]), expected.astype(np.int64))[0]
         assert type(reward) is float
         assert terminated is False
         assert truncated is (t == game.max_episode_steps)
@@ -193,9 +188,7 @@ def test_a_refused_reset_leaves_the_episode_alone() -> None:
         ({"game": Maneuverer(), "size": 3}, TypeError, "go with a game's name or class"),
     ],
 )
-def test_unknown_and_impossible_arguments_are_named(
-    arguments: dict[str, Any], error: type[Exception], message: str
-) -> None:
+def test_unknown_and_impossible_arguments_are_named(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         gym.make("mbagent/Maneuverer-v0", **arguments)
 

@@ -87,9 +87,7 @@ def test_other_goals_mean_what_they_say() -> None:
         ({"stay": "yes"}, TypeError, "stay must be True or False"),
     ],
 )
-def test_impossible_arguments_are_named(
-    arguments: dict[str, Any], error: type[Exception], message: str
-) -> None:
+def test_impossible_arguments_are_named(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         FlierCatcher(**arguments)
 

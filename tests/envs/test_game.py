@@ -42,9 +42,7 @@ def test_goals_are_pure_and_take_any_integer_type(game: Game) -> None:
     next_obs = game.transition(obs, actions, derive(8, np.arange(200)))
     assert len(game.reward_functions) >= 4
     assert next(iter(game.reward_functions)) == "default"
-    np.testing.assert_array_equal(
-        game.reward_functions["default"](obs, actions, next_obs), game.reward(obs, actions, next_obs)
-    )
+    np.testing.assert_array_equal(game.reward_functions["default"](obs, actions, next_obs), game.reward(obs, actions, next_obs))
     for name, goal in game.reward_functions.items():
         earned = goal(obs, actions, next_obs)
         assert earned.dtype == np.float64, name
@@ -70,9 +68,7 @@ def test_listed_successors_have_the_frequencies_of_sampled_ones(game: Game) -> N
             assert (probabilities > 0).all()
             assert len(np.unique(following.reshape(len(following), -1), axis=0)) == len(following)
             n = 4000
-            sampled = game.transition(
-                np.repeat(state[None], n, axis=0), np.full(n, action), derive(3, np.arange(n))
-            )
+            sampled = game.transition(np.repeat(state[None], n, axis=0), np.full(n, action), derive(3, np.arange(n)))
             counts = np.array([(sampled == row).reshape(n, -1).all(axis=1).sum() for row in following])
             assert counts.sum() == n
             error = np.sqrt(n * probabilities * (1 - probabilities))
@@ -86,9 +82,7 @@ def test_a_game_can_be_built_again_copied_and_pickled(game: Game) -> None:
     obs = wandered_states(game, 20)
     actions, keys = np.zeros(20, dtype=np.int64), derive(1, np.arange(20))
     for other in (again, copy.deepcopy(game), pickle.loads(pickle.dumps(game))):
-        np.testing.assert_array_equal(
-            other.transition(obs, actions, keys), game.transition(obs, actions, keys)
-        )
+        np.testing.assert_array_equal(other.transition(obs, actions, keys), game.transition(obs, actions, keys))
         assert other.reward_functions.keys() == game.reward_functions.keys()
 
 
@@ -98,9 +92,7 @@ def test_goals_cannot_be_replaced_by_accident(game: Game) -> None:
         game.reward_functions["default"] = game.reward  # type: ignore[index]
 
 
-@pytest.mark.parametrize(
-    ("game", "score"), [(GeyserRunner(), 24.2), (Maneuverer(), 1.1), (FlierCatcher(), 12.75)], ids=repr
-)
+@pytest.mark.parametrize(("game", "score"), [(GeyserRunner(), 24.2), (Maneuverer(), 1.1), (FlierCatcher(), 12.75)], ids=repr)
 def test_random_play_scores_what_it_always_has(game: Game, score: float) -> None:
     earned = returns(game, None, game.reward, episodes=2000, seed=0)
     assert abs(earned.mean() - score) < 4 * earned.std() / np.sqrt(2000)
@@ -121,9 +113,7 @@ def test_observations_that_are_no_state_are_refused(game: Game) -> None:
     assert game.check_observations(obs[:0]).shape == (0, *game.observation_space.shape)
 
 
-@pytest.mark.parametrize(
-    "actions", [[0, -1], [0, 99], [0.0, 1.0], [True, False], [0], 0, [[0, 0]], ["up", "up"]]
-)
+@pytest.mark.parametrize("actions", [[0, -1], [0, 99], [0.0, 1.0], [True, False], [0], 0, [[0, 0]], ["up", "up"]])
 def test_actions_outside_the_space_are_refused(actions: object) -> None:
     for game in DEFAULTS:
         with pytest.raises(InvalidActionError, match="actions must be 2 integers from 0 to"):

@@ -14,9 +14,7 @@ def state(game: GeyserRunner, position: int, erupting: int) -> Any:
     return obs
 
 
-def step(
-    game: GeyserRunner, position: int, erupting: int, action: str, key: int = 0
-) -> tuple[int, int, float]:
+def step(game: GeyserRunner, position: int, erupting: int, action: str, key: int = 0) -> tuple[int, int, float]:
     obs, number = state(game, position, erupting)[None], np.array([game.action_names.index(action)])
     after = game.transition(obs, number, derive(key, 0))
     reward = game.reward(obs, number, after)[0]
@@ -106,9 +104,7 @@ def test_the_scene_shows_who_stands_where() -> None:
         ({"stay": 1}, TypeError, "stay must be True or False"),
     ],
 )
-def test_impossible_arguments_are_named(
-    arguments: dict[str, Any], error: type[Exception], message: str
-) -> None:
+def test_impossible_arguments_are_named(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         GeyserRunner(**arguments)
 

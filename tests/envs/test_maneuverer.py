@@ -14,9 +14,7 @@ from tests.envs.helpers import start_states, wandered_states
 def board(*rows: str) -> npt.NDArray[np.int8]:
     """Read a picture: @ player, # wall, * target, & both player and target."""
     cells = np.array([list(row) for row in rows])
-    return np.array([(cells == "@") | (cells == "&"), cells == "#", (cells == "*") | (cells == "&")]).astype(
-        np.int8
-    )
+    return np.array([(cells == "@") | (cells == "&"), cells == "#", (cells == "*") | (cells == "&")]).astype(np.int8)
 
 
 def reached(walls: npt.NDArray[np.int8], start: tuple[int, int]) -> set[tuple[int, int]]:
@@ -101,9 +99,7 @@ def test_layouts_have_the_distribution_of_drawing_again(density: float, player: 
     on = np.zeros((3, size, size), dtype=np.int8)
     on[0][player] = on[2][player] = 1
     game = Maneuverer(size=size, wall_density=density)
-    drawn = game.transition(
-        np.repeat(on[None], n, axis=0), np.zeros(n, dtype=np.int64), derive(0, np.arange(n))
-    )
+    drawn = game.transition(np.repeat(on[None], n, axis=0), np.zeros(n, dtype=np.int64), derive(0, np.arange(n)))
     counts = Counter(row.tobytes() for row in drawn)
     assert counts.keys() <= exact.keys()
     expected = np.array([n * exact[layout] / total for layout in exact])
@@ -165,9 +161,7 @@ def test_what_cannot_be_listed_says_so() -> None:
         ({"wall_density": False}, TypeError, "wall_density must be a number"),
     ],
 )
-def test_impossible_arguments_are_named(
-    arguments: dict[str, Any], error: type[Exception], message: str
-) -> None:
+def test_impossible_arguments_are_named(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         Maneuverer(**arguments)
 

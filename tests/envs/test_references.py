@@ -28,11 +28,7 @@ def test_references_reach_the_known_scores(game: Game, reference: float) -> None
 
 @pytest.mark.parametrize(
     ("game", "name"),
-    [
-        (game, name)
-        for game in (GeyserRunner(mode="deterministic"), *DEFAULTS)
-        for name in game.reward_functions
-    ],
+    [(game, name) for game in (GeyserRunner(mode="deterministic"), *DEFAULTS) for name in game.reward_functions],
     ids=str,
 )
 def test_every_goal_separates_good_play_from_random_play(game: Game, name: str) -> None:
@@ -86,9 +82,7 @@ def distances(obs: Bits) -> Ints:
     steps = np.where(obs[2] == 1, 0, 10_000)
     for _ in range(size * size):
         padded = np.pad(steps, 1, constant_values=10_000)
-        near = (
-            np.minimum.reduce([padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]]) + 1
-        )
+        near = np.minimum.reduce([padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:]]) + 1
         steps = np.where(obs[1] == 1, 10_000, np.minimum(steps, near))
     return steps
 
@@ -108,9 +102,7 @@ def test_maneuverer_always_comes_one_step_nearer(game: Maneuverer) -> None:
 def test_maneuverer_redraws_when_the_goal_is_out_of_reach() -> None:
     policy = reference_policy(Maneuverer(size=3), "corner")
     assert policy is not None
-    assert policy(board("#..", "@..", "*..")[None]).tolist() == [
-        2
-    ]  # the corner is a wall: only a redraw helps
+    assert policy(board("#..", "@..", "*..")[None]).tolist() == [2]  # the corner is a wall: only a redraw helps
     assert policy(board("...", "@..", "*..")[None]).tolist() == [0]
 
 

@@ -13,9 +13,7 @@ each_variant = pytest.mark.parametrize(("env_id", "arguments"), ID_ARGUMENTS)
 MODES = list(AutoresetMode)
 
 
-def pair(
-    env_id: str, autoreset: AutoresetMode, **arguments: Any
-) -> tuple[gym.vector.VectorEnv, gym.vector.VectorEnv]:
+def pair(env_id: str, autoreset: AutoresetMode, **arguments: Any) -> tuple[gym.vector.VectorEnv, gym.vector.VectorEnv]:
     """Return this project's vector environment and Gymnasium's: three copies, episodes of seven steps."""
     arguments = {"num_envs": 3, "max_episode_steps": 7, **arguments}
     own = gym.make_vec(env_id, autoreset_mode=autoreset.value, **arguments)
@@ -45,9 +43,7 @@ def assert_same(own: Any, sync: Any) -> None:
 
 @each_variant
 @pytest.mark.parametrize("mode", MODES)
-def test_copies_follow_the_single_environments(
-    env_id: str, arguments: dict[str, Any], mode: AutoresetMode
-) -> None:
+def test_copies_follow_the_single_environments(env_id: str, arguments: dict[str, Any], mode: AutoresetMode) -> None:
     own, sync = pair(env_id, mode, **arguments)
     assert own.metadata["autoreset_mode"] is mode
     for space in ("observation_space", "action_space", "single_observation_space", "single_action_space"):
@@ -60,9 +56,7 @@ def test_copies_follow_the_single_environments(
         assert_same(result, sync.step(actions))
         if mode is AutoresetMode.DISABLED and result[3].any():
             mask = result[2] | result[3]
-            assert_same(
-                own.reset(options={"reset_mask": mask}), sync.reset(options={"reset_mask": mask.copy()})
-            )
+            assert_same(own.reset(options={"reset_mask": mask}), sync.reset(options={"reset_mask": mask.copy()}))
         if t == 20:
             assert_same(own.reset(), sync.reset())
     assert own.np_random_seed == sync.np_random_seed
@@ -97,9 +91,7 @@ def test_games_that_end_restart_at_the_right_time(mode: AutoresetMode) -> None:
         if mode is AutoresetMode.DISABLED and done.any():
             with pytest.raises(gym.error.ResetNeeded, match="have ended"):
                 own.step(actions)
-            assert_same(
-                own.reset(options={"reset_mask": done}), sync.reset(options={"reset_mask": done.copy()})
-            )
+            assert_same(own.reset(options={"reset_mask": done}), sync.reset(options={"reset_mask": done.copy()}))
     assert ended > 50
 
 
@@ -126,9 +118,7 @@ def test_copies_may_start_from_given_states(env_id: str) -> None:
         own.reset(options={"state": states[:2]})
     with pytest.raises(ValueError, match="not a state of"):
         own.reset(options={"state": np.zeros_like(states)})
-    with pytest.raises(
-        ValueError, match="reset knows no option 'bogus'; its options are 'state', 'reset_mask'"
-    ):
+    with pytest.raises(ValueError, match="reset knows no option 'bogus'; its options are 'state', 'reset_mask'"):
         own.reset(options={"bogus": 1})
     with pytest.raises(ValueError, match="reset_mask"):
         own.reset(options={"reset_mask": np.zeros(3, dtype=np.bool_)})

@@ -44,7 +44,8 @@ def test_search_repairs_a_lookahead_too_short_to_see_the_prize(seed: int) -> Non
 
 
 def test_several_successors_are_kept_for_an_action() -> None:
-    # Action 0 is a coin toss between +1 and -0.6 (worth 0.2), action 1 pays nothing: one remembered child would mislead.
+    # Action 0 is a coin toss between +1 and -0.6 (worth 0.2), action 1 pays nothing: one remembered child would
+    # mislead.
     table = np.zeros((4, 2, 4))
     table[0, 0, 1] = table[0, 0, 2] = 0.5
     table[0, 1, 3] = 1.0

@@ -13,9 +13,7 @@ TINY = [*CASE, "--steps", "600", "--seeds", "1", "--episodes", "2", "--workers",
 
 
 def test_help_documents_every_option() -> None:
-    told = subprocess.run(
-        [sys.executable, SCRIPT, "--help"], capture_output=True, text=True, check=True
-    ).stdout
+    told = subprocess.run([sys.executable, SCRIPT, "--help"], capture_output=True, text=True, check=True).stdout
     for name in Args.__dataclass_fields__:
         assert "--" + name.replace("_", "-") in told
     assert "ten times the steps" in " ".join(told.split())
