@@ -4,7 +4,9 @@ from mbagent.models.base import BaseTransitionModel, FitReport, Successors, Tran
 from mbagent.models.config import NeuralConfig
 from mbagent.models.networks import Conditioner, DensePredictor, FactorCodec, Predictor
 from mbagent.models.neural import NeuralTransitionModel
+from mbagent.models.planes import PlanePredictor
 from mbagent.models.simulator import SimulatorModel
+from mbagent.models.tabular import TabularModel
 from mbagent.models.training import TrainingConfig
 
 __all__ = [
@@ -15,9 +17,11 @@ __all__ = [
     "FitReport",
     "NeuralConfig",
     "NeuralTransitionModel",
+    "PlanePredictor",
     "Predictor",
     "SimulatorModel",
     "Successors",
+    "TabularModel",
     "TrainingConfig",
     "TransitionModel",
 ]

@@ -96,16 +96,16 @@ def _activate(values: Floats32, n: int, code: int) -> None:
         elif code == TANH:
             values[h] = math.tanh(value)
         else:
-            gate = np.float32(1.0) / (np.float32(1.0) + np.float32(math.exp(-max(value, np.float32(-80.0)))))
+            gate = np.float32(1.0) / (np.float32(1.0) + math.exp(-max(value, np.float32(-80.0))))
             values[h] = gate if code == SIGMOID else value * gate
 
 
 @compiled
-def active_columns(state: Ints, action: int, layout: Layout, out: Ints) -> int:
-    """Writes the input columns that are 1 to ``out`` and returns how many there are."""
+def active_columns(states: Ints, b: int, action: int, layout: Layout, out: Ints) -> int:
+    """Writes the input columns of row b that are 1 to ``out`` and returns how many there are; the action's is last."""
     n = 0
-    for factor in range(len(state)):
-        value = state[factor]
+    for factor in range(states.shape[1]):
+        value = states[b, factor]
         if layout.outputs[factor] != 2:
             out[n] = layout.start[factor] + value
             n += 1
@@ -117,62 +117,100 @@ def active_columns(state: Ints, action: int, layout: Layout, out: Ints) -> int:
 
 
 @compiled
-def _add_products(values: Floats32, n_values: int, weights: Floats32, out: Floats32, n_out: int) -> None:
+def _add_row(table: Floats32, row: int, out: Floats32) -> None:
+    for h in range(table.shape[1]):
+        out[h] += table[row, h]
+
+
+@compiled
+def _add_products(values: Floats32, n_values: int, weights: Floats32, out: Floats32) -> None:
     for h in range(n_values):
         value = values[h]
-        row = weights[h]
-        for k in range(n_out):
-            out[k] += value * row[k]
+        for k in range(weights.shape[1]):
+            out[k] += value * weights[h, k]
+
+
+@compiled
+def _dense_columns(active: Ints, n_active: int, dense: DenseWeights, now: Floats32, after: Floats32, columns: Floats32) -> None:
+    """The output columns of one row, without the residual path; ``now`` and ``after`` are work space [H]."""
+    depth = len(dense.sizes)
+    columns[:] = dense.last_bias
+    if depth == 0:
+        for a in range(n_active):
+            _add_row(dense.first, active[a], columns)
+        return
+    now[:] = dense.bias[0]
+    for a in range(n_active):
+        _add_row(dense.first, active[a], now)
+    _activate(now, dense.sizes[0], dense.activation)
+    for level in range(1, depth):
+        after[:] = dense.bias[level]
+        _add_products(now, dense.sizes[level - 1], dense.inner[level - 1], after)
+        _activate(after, dense.sizes[level], dense.activation)
+        now[:] = after
+    _add_products(now, dense.sizes[depth - 1], dense.last, columns)
 
 
 @compiled
 def dense_logits(states: Ints, actions: Ints, layout: Layout, dense: DenseWeights) -> Floats32:
     """A dense predictor's logits, float32 [B, O, K]; values a factor lacks are at -1e9."""
-    n_columns, n_outputs, depth = len(dense.last_bias), len(layout.outputs), len(dense.sizes)
-    width, n_hidden = layout.outputs.max(), dense.bias.shape[1]
+    n_outputs, width = len(layout.outputs), layout.outputs.max()
     logits = np.full((len(states), n_outputs, width), np.float32(-1e9), dtype=np.float32)
     active = np.empty(states.shape[1] + 1, dtype=np.int64)
-    now, after = np.empty(n_hidden, dtype=np.float32), np.empty(n_hidden, dtype=np.float32)
-    columns = np.empty(n_columns, dtype=np.float32)
+    now = np.empty(dense.last.shape[0], dtype=np.float32)
+    after = np.empty_like(now)
+    columns = np.empty(len(dense.last_bias), dtype=np.float32)
     for b in range(len(states)):
-        n_active = active_columns(states[b], actions[b], layout, active)
-        columns[:] = dense.last_bias
-        if depth == 0:
-            for a in range(n_active):
-                columns += dense.first[active[a]]
-        else:
-            now[:] = dense.bias[0]
-            for a in range(n_active):
-                now += dense.first[active[a]]
-            _activate(now, dense.sizes[0], dense.activation)
-            for level in range(1, depth):
-                after[:] = dense.bias[level]
-                _add_products(now, dense.sizes[level - 1], dense.inner[level - 1], after, dense.sizes[level])
-                _activate(after, dense.sizes[level], dense.activation)
-                now, after = after, now
-            _add_products(now, dense.sizes[depth - 1], dense.last, columns, n_columns)
-        stay = dense.stay[actions[b]]
-        columns[: layout.n_state_columns] -= stay
+        n_active = active_columns(states, b, actions[b], layout, active)
+        _dense_columns(active, n_active, dense, now, after, columns)
+        for column in range(layout.n_state_columns):
+            columns[column] -= dense.stay[actions[b], column]
         for a in range(n_active - 1):
-            columns[active[a]] += np.float32(2.0) * stay[active[a]]
+            columns[active[a]] += np.float32(2.0) * dense.stay[actions[b], active[a]]
         for i in range(n_outputs):
+            start = layout.start[i]
             if layout.outputs[i] == 2:
                 logits[b, i, 0] = 0.0
-                logits[b, i, 1] = columns[layout.start[i]]
+                logits[b, i, 1] = columns[start]
             else:
                 for k in range(layout.outputs[i]):
-                    logits[b, i, k] = columns[layout.start[i] + k]
+                    logits[b, i, k] = columns[start + k]
     return logits
 
 
 @compiled
+def probabilities(logits: Floats32, outputs: Ints) -> Floats:
+    """Each factor's distribution, float64 [B, O, K], from logits [B, O, K]; 0 for values a factor lacks."""
+    out = np.zeros(logits.shape, dtype=np.float64)
+    row_logits = np.empty(logits.shape[2], dtype=np.float32)
+    row = np.empty(logits.shape[2], dtype=np.float64)
+    for b in range(logits.shape[0]):
+        for i in range(logits.shape[1]):
+            n = outputs[i]
+            if n == 2:  # written out: a call costs ten times as much, and bits are the common case
+                difference = np.float64(logits[b, i, 1]) - np.float64(logits[b, i, 0])
+                small = math.exp(-abs(difference))
+                large = 1.0 / (1.0 + small)
+                out[b, i, 0] = small * large if difference > 0 else large
+                out[b, i, 1] = large if difference > 0 else small * large
+                continue
+            for k in range(n):
+                row_logits[k] = logits[b, i, k]
+            softmax(row_logits, n, row)
+            for k in range(n):
+                out[b, i, k] = row[k]
+    return out
+
+
+@compiled
 def softmax(logits: Floats32, n: int, out: Floats) -> None:
-    """Writes the distribution of a factor with ``n`` values to ``out`` [K], from its logits [K]."""
+    """Writes the distribution over the first ``n`` values to ``out``."""
     if n == 2:  # one exponential instead of two: bits are the common case
         difference = np.float64(logits[1]) - np.float64(logits[0])
         small = math.exp(-abs(difference))
-        out[0 if difference > 0 else 1] = small / (1.0 + small)
-        out[1 if difference > 0 else 0] = 1.0 / (1.0 + small)
+        large = 1.0 / (1.0 + small)
+        out[0] = small * large if difference > 0 else large
+        out[1] = large if difference > 0 else small * large
         return
     top = np.float64(logits[0])
     for k in range(1, n):
@@ -186,87 +224,53 @@ def softmax(logits: Floats32, n: int, out: Floats) -> None:
 
 
 @compiled
-def probabilities(logits: Floats32, outputs: Ints) -> Floats:
-    """Each factor's distribution, float64 [B, O, K], from logits [B, O, K]; 0 for values a factor lacks."""
-    out = np.zeros(logits.shape, dtype=np.float64)
-    if logits.shape[2] == 2:  # written out, since slices of arrays cost more than the arithmetic
-        for b in range(logits.shape[0]):
-            for i in range(logits.shape[1]):
-                difference = np.float64(logits[b, i, 1]) - np.float64(logits[b, i, 0])
-                small = math.exp(-abs(difference))
-                large = 1.0 / (1.0 + small)
-                out[b, i, 1] = large if difference > 0 else small * large
-                out[b, i, 0] = small * large if difference > 0 else large
-        return out
-    for b in range(logits.shape[0]):
-        for i in range(logits.shape[1]):
-            softmax(logits[b, i], outputs[i], out[b, i])
-    return out
-
-
-@compiled
-def conditional(
-    i: int,
-    base: Floats32,
-    active: Ints,
-    n_active: int,
-    factors: Ints,
-    layout: Layout,
-    group: GroupWeights,
-    hidden: Floats32,
-    logits: Floats32,
-    out: Floats,
-) -> None:
-    """Writes P(y_i | s, a, y_<i) to ``out``, for a factor that has a group.
-
-    ``base`` [K] are the predictor's logits, ``factors`` [O] holds y_<i, ``hidden`` [G] and ``logits`` [K] are work
-    space.
-    """
-    g = group.group_of[i]
-    hidden[:] = group.bias[g]
-    for a in range(n_active):
-        hidden += group.inputs[g, active[a]]
-    for j in range(i):
-        if layout.outputs[j] != 2:
-            hidden += group.others[g, layout.start[j] + factors[j]]
-        elif factors[j] == 1:
-            hidden += group.others[g, layout.start[j]]
-    finish(i, base, layout, group, hidden, logits, out)
-
-
-@compiled
-def finish(
-    i: int,
-    base: Floats32,
-    layout: Layout,
-    group: GroupWeights,
-    hidden: Floats32,
-    logits: Floats32,
-    out: Floats,
-) -> None:
-    """From the summed input of factor i's group (overwritten) to the factor's distribution."""
-    n, g = layout.outputs[i], group.group_of[i]
-    _activate(hidden, len(hidden), group.activation)
-    for k in range(n):
-        logits[k] = group.offset[g, k] + (base[k] if group.correction else np.float32(0.0))
-    for h in range(len(hidden)):
-        value = hidden[h]
-        for k in range(n):
-            logits[k] += value * group.readout[g, h, k]
-    softmax(logits, n, out)
-
-
-@compiled
-def largest(values: Floats, n: int) -> int:
-    """Index of the largest of the first ``n`` values."""
+def largest(probs: Floats, b: int, i: int, n: int) -> int:
+    """The likeliest of the ``n`` values of factor i in row b; the lowest of equals."""
     best = 0
     for k in range(1, n):
-        if values[k] > values[best]:
+        if probs[b, i, k] > probs[b, i, best]:
             best = k
     return best
 
 
 @compiled
-def trusted(i: int, values: Floats, layout: Layout, group: GroupWeights, certain: float) -> bool:
-    """Whether factor i is left to the predictor, which gives it the distribution ``values``."""
-    return bool(group.group_of[i] < 0 or values[largest(values, layout.outputs[i])] >= certain)
+def trusted(probs: Floats, b: int, i: int, layout: Layout, group: GroupWeights, certain: float) -> bool:
+    """Whether factor i of row b is left to the predictor, which gives it the distributions ``probs`` [B, O, K]."""
+    if group.group_of[i] < 0:
+        return True
+    return bool(probs[b, i, largest(probs, b, i, layout.outputs[i])] >= certain)
+
+
+@compiled
+def add_columns(table: Floats32, g: int, columns: Ints, n_columns: int, hidden: Floats32) -> None:
+    """Adds to ``hidden`` [G] what group g gets from the first ``n_columns`` of ``columns``; ``table`` is [g, columns, G]."""
+    for c in range(n_columns):
+        column = columns[c]
+        for h in range(table.shape[2]):
+            hidden[h] += table[g, column, h]
+
+
+@compiled
+def finish(
+    b: int,
+    i: int,
+    logits: Floats32,
+    layout: Layout,
+    group: GroupWeights,
+    hidden: Floats32,
+    row_logits: Floats32,
+    out: Floats,
+) -> None:
+    """From the summed input of factor i's group (overwritten) to the factor's distribution ``out`` [K].
+
+    ``logits`` [B, O, K] are the predictor's, ``row_logits`` [K] is work space.
+    """
+    n, g = layout.outputs[i], group.group_of[i]
+    _activate(hidden, len(hidden), group.activation)
+    for k in range(n):
+        row_logits[k] = group.offset[g, k] + (logits[b, i, k] if group.correction else np.float32(0.0))
+    for h in range(len(hidden)):
+        value = hidden[h]
+        for k in range(n):
+            row_logits[k] += value * group.readout[g, h, k]
+    softmax(row_logits, n, out)

@@ -8,6 +8,7 @@ cardinality, G hidden nodes in a group.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Literal, Protocol, TypeAlias
@@ -194,7 +195,7 @@ class DensePredictor(nn.Module):
         self.codec = codec
         self.activation = activation
         sizes = (codec.n_inputs, *hidden)
-        self.layers = nn.ModuleList(Affine(a, b, generator) for a, b in zip(sizes, sizes[1:], strict=False))
+        self.layers = nn.ModuleList(Affine(a, b, generator) for a, b in itertools.pairwise(sizes))
         self.dropout = Dropout(dropout)
         self.out = Affine(sizes[-1], codec.n_columns, generator)
         if residual:

@@ -220,7 +220,8 @@ class NeuralTransitionModel(BaseTransitionModel):
         logits, probs = self._predict(states, actions)
         if self.config.conditioner is None:
             with np.errstate(divide="ignore"):
-                return np.log(np.take_along_axis(probs, outcomes[:, :, None], axis=2)[:, :, 0]).sum(axis=1)
+                result: Floats = np.log(np.take_along_axis(probs, outcomes[:, :, None], axis=2)[:, :, 0]).sum(axis=1)
+            return result
         return log_prob_causal(states, actions, outcomes, logits, probs, self._layout, self._packed_groups(), self.config.certain)
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:

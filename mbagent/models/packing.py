@@ -18,7 +18,7 @@ from mbagent.models.kernels import (
     Layout,
     dense_logits,
 )
-from mbagent.models.networks import Conditioner, DensePredictor, FactorCodec
+from mbagent.models.networks import Affine, Conditioner, DensePredictor, FactorCodec
 from mbagent.models.plane_kernels import pack_planes, plane_logits
 from mbagent.models.planes import PlanePredictor
 
@@ -64,7 +64,7 @@ def pack_layout(codec: FactorCodec) -> Layout:
 
 def pack_dense(predictor: DensePredictor) -> DenseWeights:
     """A dense predictor's weights, padded to its widest hidden layer."""
-    layers = list(predictor.layers)
+    layers = [layer for layer in predictor.layers if isinstance(layer, Affine)]
     sizes = np.asarray([len(layer.bias) for layer in layers], dtype=np.int64)
     depth, width = len(sizes), int(sizes.max(initial=1))
     inner = np.zeros((max(depth - 1, 0), width, width), dtype=np.float32)

@@ -99,7 +99,7 @@ def plane_logits(states: Ints, actions: Ints, w: PlaneWeights, width: int) -> Fl
     cells = height * columns
     logits = np.zeros((n_rows, n_factors + 1, width), dtype=np.float32)
     plain = np.empty((height, columns, hidden), dtype=np.float32)
-    active = np.empty_like(plain)
+    padded = np.zeros((height + 2) * (columns + 2) * hidden, dtype=np.float32)
     patches = np.zeros((BLOCK, cells, 9 * hidden), dtype=np.float32)
     above = np.empty((BLOCK * cells, hidden), dtype=np.float32)
     read = np.empty((BLOCK * cells, len(w.out_bias)), dtype=np.float32)
@@ -111,8 +111,7 @@ def plane_logits(states: Ints, actions: Ints, w: PlaneWeights, width: int) -> Fl
             b = start + j
             if b == 0 or not _same(states, b):
                 _first_layer(states[b], w, plain)
-            active[:] = plain
-            _activate_first(active, w.action[actions[b]], patches[j], top[j])
+            _activate_first(plain, w.action[actions[b]], padded, patches[j], top[j])
         np.dot(patches.reshape(BLOCK * cells, 9 * hidden), w.second, above)
         for j in range(n):
             _mix(top[j], w.second_top, w.second_bias, bias)
@@ -156,29 +155,29 @@ def _first_layer(state: Ints, w: PlaneWeights, plain: Floats32) -> None:
 
 
 @compiled
-def _activate_first(plain: Floats32, action: Floats32, patches: Floats32, top: Floats32) -> None:
+def _activate_first(plain: Floats32, action: Floats32, padded: Floats32, patches: Floats32, top: Floats32) -> None:
     """Switches the action on, and writes each position's 3x3 neighbourhood to a row of ``patches`` [H * W, 9 * D].
 
-    Neighbours beyond the border stay at zero, as they were allocated.
+    ``padded`` [(H + 2) * (W + 2) * D] holds the activations with a border of zeros: three neighbours in a row lie side
+    by side there, so a patch is three runs of 3 * D numbers.
     """
     height, columns, hidden = plain.shape
-    flat, source = patches.reshape(-1), plain.reshape(-1)
     top[:] = 0.0
     for y in range(height):
         for x in range(columns):
-            start = (y * columns + x) * hidden
+            cell = padded[((y + 1) * (columns + 2) + x + 1) * hidden :][:hidden]
+            source = plain[y, x]
             for d in range(hidden):
-                value = max(source[start + d] + action[d], np.float32(0.0))
-                source[start + d] = value
+                value = max(source[d] + action[d], np.float32(0.0))
+                cell[d] = value
                 top[d] = max(top[d], value)
+    run = 3 * hidden
     for y in range(height):
         for x in range(columns):
-            start = (y * columns + x) * hidden
-            for dy in range(max(0, y + 2 - height), min(3, y + 2)):
-                for dx in range(max(0, x + 2 - columns), min(3, x + 2)):
-                    place = (((y + 1 - dy) * columns + x + 1 - dx) * 9 + dy * 3 + dx) * hidden
-                    for d in range(hidden):
-                        flat[place + d] = source[start + d]
+            row = patches[y * columns + x]
+            for dy in range(3):
+                start = ((y + dy) * (columns + 2) + x) * hidden
+                row[dy * run : (dy + 1) * run] = padded[start : start + run]
 
 
 @compiled

@@ -19,7 +19,7 @@ from mbagent.models.base import (
     Successors,
     as_keys,
 )
-from mbagent.models.systematic import thin
+from mbagent.models.thinning import thin
 from mbagent.spaces import FactoredSpace
 from mbagent.transitions import TransitionDataset
 from mbagent_envs import Game

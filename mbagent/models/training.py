@@ -201,7 +201,7 @@ class Trainer:
     def _mean(self, row_losses: RowLosses, rows: Examples) -> Tensor:
         """Weighted mean cross-entropy of each factor, float64 [O]."""
         total, weight = torch.zeros(len(self.codec.outputs), dtype=torch.float64), 1e-12
-        for part in torch.arange(len(rows)).split(4096):
+        for part in torch.split(torch.arange(len(rows)), 4096):
             batch = rows.select(part)
             total += (row_losses(batch, "cross_entropy") * batch.weights[:, None]).sum(dim=0)
             weight += float(batch.weights.sum())
@@ -283,7 +283,7 @@ def batches(rows: Examples, size: int, n_steps: int, generator: torch.Generator)
     """``n_steps`` batches, reshuffled at each pass over the rows."""
     done = 0
     while done < n_steps:
-        for part in torch.randperm(len(rows), generator=generator).split(size):
+        for part in torch.split(torch.randperm(len(rows), generator=generator), size):
             if done == n_steps:
                 return
             yield rows.select(part)

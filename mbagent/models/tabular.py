@@ -1,0 +1,226 @@
+"""A table of counts: exact where every (state, action) is met often, blind where it was never met (paper section 2.1)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.base import (
+    Actions,
+    BaseTransitionModel,
+    Bools,
+    FitReport,
+    Floats,
+    Randomness,
+    States,
+    Successors,
+    as_keys,
+    hash_rows,
+)
+from mbagent.models.thinning import thin
+from mbagent.transitions import TransitionBatch, TransitionDataset
+from mbagent_envs._compiled import compiled
+from mbagent_envs.random_keys import derive, uniforms
+
+_ARRAYS = ("states", "actions", "next_states", "terminated", "counts")
+
+
+class TabularModel(BaseTransitionModel):
+    """Frequencies of the outcomes met after each (state, action), with a prior that nothing changes.
+
+    The probability of an outcome met c times in n is (c + prior if it is "the same state, not terminated") / (n + prior).
+    After a pair never met, nothing changes.
+
+    Args:
+        cardinalities: number of values of each state factor, length F.
+        n_actions: number of enumerated actions A.
+        prior: weight of "nothing changes", in transitions.
+        validation: share of episodes held out to measure the fit; the final table is made of all.
+    """
+
+    def __init__(self, cardinalities: tuple[int, ...], n_actions: int, *, prior: float = 0.0, validation: float = 0.1) -> None:
+        """See the class."""
+        super().__init__(cardinalities, n_actions)
+        self.prior = float(prior)
+        self.validation = float(validation)
+        none = np.zeros(0, dtype=np.int64)
+        ints = np.zeros((0, len(self.cardinalities)), dtype=np.int64)
+        self._store(ints, none, ints, none.astype(np.bool_), none)
+
+    def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
+        """See TransitionModel. Counts all of ``data`` anew; ``seed`` says which episodes the report's figures hold out."""
+        began = time.perf_counter()
+        train, held_out = data.split(self.validation, seed)
+        self._count(train)
+        loss, exact = self._measure(held_out)
+        self._count(data.rows())
+        if progress is not None:
+            progress(1.0)
+        pairs = float(len(self._pairs))
+        return FitReport(
+            n_train=len(data),
+            n_validation=len(held_out),
+            epochs=1,
+            seconds=time.perf_counter() - began,
+            predictor_loss=loss,
+            exact_match=exact,
+            log={"known_pairs": pairs, "outcomes": float(len(self._counts))},
+        )
+
+    def visits(self, states: States, actions: Actions) -> NDArray[np.int64]:
+        """How often each (state, action) was met, int64 [B]."""
+        pair = self._find(states, actions)
+        totals = np.append(self._totals, 0)
+        result: NDArray[np.int64] = totals[pair]
+        return result
+
+    def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
+        """See TransitionModel."""
+        u = uniforms(as_keys(rng, len(states)), 1)[:, 0]
+        pair = self._find(states, actions)
+        chosen = _choose(pair, self._offsets, self._weights, u)
+        known = chosen >= 0
+        next_states, terminated = states.astype(np.int64), np.zeros(len(states), dtype=np.bool_)
+        next_states[known], terminated[known] = self._next_states[chosen[known]], self._terminated[chosen[known]]
+        return next_states, terminated
+
+    def marginals(self, states: States, actions: Actions) -> Floats:
+        """See TransitionModel; exact."""
+        found = self._full(states, actions)
+        starts = np.concatenate([[0], np.cumsum(self.cardinalities)[:-1]])
+        result = np.zeros((len(states), sum(self.cardinalities)))
+        np.add.at(result, (found.rows[:, None], starts + found.states), found.probabilities[:, None])
+        return result
+
+    def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
+        """See TransitionModel; minus infinity for outcomes never met."""
+        found = self._full(states, actions)
+        rows = found.rows
+        met = (found.states == next_states[rows]).all(axis=1) & (found.terminated == terminated[rows])
+        mass = np.bincount(rows[met], weights=found.probabilities[met], minlength=len(states))
+        with np.errstate(divide="ignore"):
+            result: Floats = np.log(mass)
+        return result
+
+    def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
+        """See TransitionModel; all outcomes met, with their probabilities, where they are few."""
+        return thin(self._full(states, actions), n_samples, seed)
+
+    def state_dict(self) -> dict[str, NDArray[Any]]:
+        """See TransitionModel: distinct transitions and how often each was met."""
+        sources = np.repeat(np.arange(len(self._pairs)), np.diff(self._offsets))
+        arrays = (
+            self._pair_states[sources],
+            self._pair_actions[sources],
+            self._next_states,
+            self._terminated,
+            self._counts,
+        )
+        kept = self._counts > 0
+        return {name: array[kept].copy() for name, array in zip(_ARRAYS, arrays, strict=True)}
+
+    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """See TransitionModel.
+
+        Raises:
+            ValueError: these are not the arrays of a table over states of this width; nothing is changed then.
+        """
+        if sorted(state) != sorted(_ARRAYS):
+            raise ValueError(f"A table has the arrays {', '.join(_ARRAYS)}, but was given {', '.join(sorted(state))}.")
+        wide = (len(state["counts"]), len(self.cardinalities))
+        if np.shape(state["states"]) != wide or np.shape(state["next_states"]) != wide:
+            raise ValueError(
+                f"This table is over states of {wide[1]} factors, but was given arrays of shape "
+                f"{np.shape(state['states'])}; build the model for the space that the table was saved from."
+            )
+        states, actions, next_states, terminated, counts = (np.asarray(state[name]).astype(np.int64) for name in _ARRAYS)
+        self._store(states, actions, next_states, terminated == 1, counts)
+
+    def _count(self, rows: TransitionBatch) -> None:
+        outcome = np.concatenate([rows.next_states, rows.terminated[:, None].astype(np.int64)], axis=1)
+        tags = derive(hash_rows(outcome), _pair_tags(rows.states, rows.actions))
+        _, first, counts = np.unique(tags, return_index=True, return_counts=True)
+        distinct = rows.select(first)
+        self._store(distinct.states, distinct.actions, distinct.next_states, distinct.terminated, counts)
+
+    def _store(self, states: States, actions: Actions, next_states: States, terminated: Bools, counts: NDArray[np.int64]) -> None:
+        """Builds the table from distinct transitions, adding "nothing changes" to each pair if the prior asks for it."""
+        if self.prior > 0.0 and len(counts):
+            _, first = np.unique(_pair_tags(states, actions), return_index=True)
+            same = (next_states == states).all(axis=1) & ~terminated
+            missing = first[~np.isin(_pair_tags(states, actions)[first], _pair_tags(states[same], actions[same]))]
+            states = np.concatenate([states, states[missing]])
+            actions = np.concatenate([actions, actions[missing]])
+            next_states = np.concatenate([next_states, states[missing]])
+            terminated = np.concatenate([terminated, np.zeros(len(missing), dtype=np.bool_)])
+            counts = np.concatenate([counts, np.zeros(len(missing), dtype=np.int64)])
+        tags = _pair_tags(states, actions)
+        order = np.lexsort((terminated, *next_states.T[::-1], tags))  # one order, whatever the order of experience
+        self._pairs, first, sizes = np.unique(tags[order], return_index=True, return_counts=True)
+        self._pair_states, self._pair_actions = states[order][first], actions[order][first]
+        self._next_states, self._terminated = next_states[order], terminated[order]
+        self._counts = counts[order].astype(np.int64)
+        self._offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+        source = np.repeat(np.arange(len(sizes)), sizes)
+        self._totals = np.bincount(source, weights=self._counts, minlength=len(sizes)).astype(np.int64)
+        same = (self._next_states == self._pair_states[source]).all(axis=1) & ~self._terminated
+        self._weights = (self._counts + self.prior * same) / (self._totals + self.prior)[source]
+
+    def _find(self, states: States, actions: Actions) -> NDArray[np.int64]:
+        """Number of each (state, action) in the table, int64 [B]; -1 if it was never met."""
+        tags = _pair_tags(states, actions)
+        if len(self._pairs) == 0:
+            return np.full(len(tags), -1, dtype=np.int64)
+        place = np.minimum(np.searchsorted(self._pairs, tags), len(self._pairs) - 1)
+        return np.where(self._pairs[place] == tags, place, -1).astype(np.int64)
+
+    def _full(self, states: States, actions: Actions) -> Successors:
+        """All outcomes of each row; of a pair never met, that nothing changes."""
+        pair = self._find(states, actions)
+        starts = np.append(self._offsets, self._offsets[-1])
+        counts = np.where(pair >= 0, np.diff(starts)[pair], 1)
+        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        rows = np.repeat(np.arange(len(states)), counts)
+        entry = np.arange(len(rows)) - offsets[rows] + starts[pair[rows]]
+        known = pair[rows] >= 0
+        next_states, terminated = states[rows].astype(np.int64), np.zeros(len(rows), dtype=np.bool_)
+        weights = np.ones(len(rows))
+        next_states[known], terminated[known] = self._next_states[entry[known]], self._terminated[entry[known]]
+        weights[known] = self._weights[entry[known]]
+        return Successors(offsets, next_states, terminated, weights)
+
+    def _measure(self, rows: TransitionBatch) -> tuple[float, float]:
+        """Held-out nats a transition, over those whose outcome was met before, and share of likeliest outcomes met."""
+        if len(rows) == 0:
+            return 0.0, 1.0
+        logs = self.log_prob(rows.states, rows.actions, rows.next_states, rows.terminated)
+        found = self._full(rows.states, rows.actions)
+        order = np.lexsort((-found.probabilities, found.rows))[found.offsets[:-1]]
+        exact = (found.states[order] == rows.next_states).all(axis=1) & (found.terminated[order] == rows.terminated)
+        finite = np.isfinite(logs)
+        return float(-logs[finite].mean()) if finite.any() else 0.0, float(exact.mean())
+
+
+@compiled
+def _choose(pair: NDArray[np.int64], offsets: NDArray[np.int64], weights: Floats, u: Floats) -> NDArray[np.int64]:
+    """The entry of the table drawn for each row, by the inverse of its pair's running sum at ``u``; -1 for unknown pairs."""
+    chosen = np.full(len(pair), -1, dtype=np.int64)
+    for b in range(len(pair)):
+        if pair[b] < 0:
+            continue
+        left = u[b]
+        for entry in range(offsets[pair[b]], offsets[pair[b] + 1]):
+            if weights[entry] > 0.0:
+                chosen[b] = entry
+                left -= weights[entry]
+                if left < 0.0:
+                    break
+    return chosen
+
+
+def _pair_tags(states: States, actions: Actions) -> NDArray[np.uint64]:
+    return derive(hash_rows(states), actions)
