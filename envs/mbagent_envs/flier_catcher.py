@@ -144,16 +144,15 @@ class FlierCatcher(Game):
     def _follow(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
         return as_floats((next_obs[:, 0, :, 0] & next_obs[:, 1, :, 1]).any(axis=1))
 
-    def transition_distribution(self, obs: Bits, action: int) -> tuple[Bits, Floats]:
-        """Enumerate the new flier's rows, and none; see `Game.transition_distribution`."""
-        following = self.transition(obs[None], np.array([action]), np.zeros(1, dtype=np.uint64))
+    def transition_distributions(self, obs: Bits, actions: npt.NDArray[Any]) -> tuple[Bits, Floats]:
+        """Enumerate the new flier's rows, and none; see `Game.transition_distributions`."""
+        following = self.transition(obs, actions, np.zeros(len(obs), dtype=np.uint64))
         following[:, 1, :, -1] = 0
-        following = np.repeat(following, self.height + 1, axis=0)
-        following[1:, 1, :, -1] = np.eye(self.height, dtype=np.int8)
-        probabilities = np.full(self.height + 1, self.spawn_rate / self.height)
-        probabilities[0] = 1 - self.spawn_rate
-        possible = probabilities > 0
-        return following[possible], probabilities[possible]
+        outcomes = np.repeat(following[:, None], self.height + 1, axis=1)
+        outcomes[:, 1:, 1, :, -1] = np.eye(self.height, dtype=np.int8)
+        probabilities = np.full((len(obs), self.height + 1), self.spawn_rate / self.height)
+        probabilities[:, 0] = 1 - self.spawn_rate
+        return outcomes, probabilities
 
     def invalid(self, obs: Bits) -> str | None:
         """Say what makes a row no state of this game; see `Game.invalid`."""

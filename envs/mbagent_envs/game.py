@@ -144,6 +144,24 @@ class Game(ABC):
         Raises:
             NotImplementedError: if the successors are too many to list.
         """
+        outcomes, probabilities = self.transition_distributions(obs[None], np.array([action]))
+        possible = probabilities[0] > 0
+        return outcomes[0, possible], probabilities[0, possible]
+
+    def transition_distributions(self, obs: Bits, actions: npt.NDArray[Any]) -> tuple[Bits, Floats]:
+        """Enumerate what may follow, for a batch; games that can list their successors override this.
+
+        Args:
+            obs: int8 ``[B, *shape]``.
+            actions: integers ``[B]``.
+
+        Returns:
+            ``M`` distinct next observations of each row, int8 ``[B, M, *shape]``, and their probabilities, float64
+            ``[B, M]``, some of which may be zero.
+
+        Raises:
+            NotImplementedError: if the successors are too many to list.
+        """
         raise NotImplementedError(f"{type(self).__name__} cannot list its successors; sample them with transition().")
 
     @abstractmethod

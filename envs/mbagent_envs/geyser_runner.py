@@ -171,15 +171,15 @@ class GeyserRunner(Game):
     def _right_edge(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
         return as_floats(next_obs[:, self.width - 1])
 
-    def transition_distribution(self, obs: Bits, action: int) -> tuple[Bits, Floats]:
-        """Enumerate the next eruptions; see `Game.transition_distribution`."""
-        following = self.transition(obs[None], np.array([action]), np.zeros(1, dtype=np.uint64))
+    def transition_distributions(self, obs: Bits, actions: npt.NDArray[Any]) -> tuple[Bits, Floats]:
+        """Enumerate the next eruptions; see `Game.transition_distributions`."""
+        following = self.transition(obs, actions, np.zeros(len(obs), dtype=np.uint64))[:, None]
         if self.mode == "deterministic":
-            return following, np.ones(1)
+            return following, np.ones((len(obs), 1))
         geysers = self.width // 2
-        following = np.repeat(following, geysers, axis=0)
-        following[:, self.width :] = np.eye(geysers, dtype=np.int8)
-        return following, np.full(geysers, 1 / geysers)
+        outcomes = np.repeat(following, geysers, axis=1)
+        outcomes[:, :, self.width :] = np.eye(geysers, dtype=np.int8)
+        return outcomes, np.full((len(obs), geysers), 1 / geysers)
 
     def invalid(self, obs: Bits) -> str | None:
         """Say what makes a row no state of this game; see `Game.invalid`."""

@@ -186,7 +186,7 @@ def _show(guess: Floats32, i: int, value: int, layout: Layout) -> None:
         guess[layout.start[i]] = float(value)
         return
     for k in range(layout.outputs[i]):
-        guess[layout.start[i] + k] = float(k == value)
+        guess[layout.start[i] + k] = 1.0 if k == value else 0.0
 
 
 @compiled

@@ -38,6 +38,7 @@ class SimulatorModel(BaseTransitionModel):
         self.space = FactoredSpace(game.observation_space)
         super().__init__(self.space.cardinalities, int(game.action_space.n))
         self._shape = game.observation_space.shape
+        self._lists = type(game).transition_distributions is not Game.transition_distributions
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """Does nothing: the rules are known."""
@@ -86,37 +87,19 @@ class SimulatorModel(BaseTransitionModel):
             return np.log(mass)
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
-        """See TransitionModel; rows whose successors the game cannot list are drawn, with numbers shared by all rows."""
-        lists = [self._list(state, action) for state, action in zip(self._observations(states), actions, strict=True)]
-        missing = np.flatnonzero([found is None for found in lists])
-        if len(missing):
-            drawn = super().successors(states[missing], actions[missing], n_samples, seed)
-            for k, row in enumerate(missing):
-                part = slice(drawn.offsets[k], drawn.offsets[k + 1])
-                lists[row] = (self._observations(drawn.states[part]), drawn.probabilities[part])
-        return thin(self._joined(states, actions, lists), n_samples, seed)
+        """See TransitionModel; where the game cannot list successors they are drawn, with numbers shared by all rows."""
+        if not self._lists:
+            return super().successors(states, actions, n_samples, seed)
+        return thin(self._listed(states, actions), n_samples, seed)
 
     def _listed(self, states: States, actions: Actions) -> Successors:
         observations = self._observations(states)
-        pairs = zip(observations, actions, strict=True)
-        return self._joined(states, actions, [self.game.transition_distribution(o, int(a)) for o, a in pairs])
-
-    def _list(self, observation: NDArray[np.int8], action: int) -> tuple[NDArray[np.int8], Floats] | None:
-        try:
-            return self.game.transition_distribution(observation, int(action))
-        except NotImplementedError:
-            return None
-
-    def _joined(self, states: States, actions: Actions, lists: list[Any]) -> Successors:
-        counts = np.asarray([len(probabilities) for _, probabilities in lists], dtype=np.int64)
-        offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        if not lists:
-            return Successors(offsets, states.copy(), np.zeros(0, dtype=np.bool_), np.zeros(0))
-        following = np.concatenate([observations for observations, _ in lists])
-        before, taken = np.repeat(self._observations(states), counts, axis=0), np.repeat(actions, counts)
-        terminated = self.game.terminated(before, taken, following)
-        weights = np.concatenate([probabilities for _, probabilities in lists])
-        return Successors(offsets, self._factors(following), terminated, weights)
+        outcomes, probabilities = self.game.transition_distributions(observations, actions)
+        rows, which = np.nonzero(probabilities)
+        following = outcomes[rows, which]
+        terminated = self.game.terminated(observations[rows], actions[rows], following)
+        offsets = np.concatenate([[0], np.cumsum((probabilities > 0).sum(axis=1))]).astype(np.int64)
+        return Successors(offsets, self._factors(following), terminated, probabilities[rows, which])
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """Empty."""

@@ -7,12 +7,9 @@ import numpy as np
 from mbagent.models.base import Successors
 from mbagent.models.particles import start
 
-FEW = 20
-"""Rows with no more successors than this are listed in full, however few draws are asked for."""
-
 
 def thin(full: Successors, n_samples: int, seed: int) -> Successors:
-    """Cuts rows with more than max(n_samples, FEW) successors down to ``n_samples`` systematic draws of them, merged.
+    """Cuts rows with more than ``n_samples`` successors down to ``n_samples`` systematic draws of them, merged.
 
     Args:
         full: all successors, with exact probabilities.
@@ -20,7 +17,7 @@ def thin(full: Successors, n_samples: int, seed: int) -> Successors:
         seed: which grid offset; the same for all rows.
     """
     counts = np.diff(full.offsets)
-    if counts.max(initial=0) <= max(n_samples, FEW):
+    if counts.max(initial=0) <= n_samples:
         return full
     rows = full.rows
     below = np.cumsum(full.probabilities)
@@ -29,7 +26,7 @@ def thin(full: Successors, n_samples: int, seed: int) -> Successors:
     ends[full.offsets[1:][counts > 0] - 1] = n_samples
     points = np.diff(ends, prepend=0.0)
     points[full.offsets[:-1][counts > 0]] = ends[full.offsets[:-1][counts > 0]]
-    listed = (counts <= max(n_samples, FEW))[rows]
+    listed = (counts <= n_samples)[rows]
     kept = listed | (points > 0)
     offsets = np.concatenate([[0], np.cumsum(np.bincount(rows[kept], minlength=len(counts)))]).astype(np.int64)
     weights = np.where(listed, full.probabilities, points / n_samples)[kept]

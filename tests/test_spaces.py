@@ -1,0 +1,106 @@
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mbagent.spaces import ActionEnumeration, FactoredSpace
+
+ELEMENTARY = st.one_of(
+    st.builds(lambda n, start: spaces.Discrete(n, start=start), st.integers(1, 9), st.integers(-5, 5)),
+    st.builds(spaces.MultiDiscrete, st.lists(st.integers(1, 5), min_size=1, max_size=4)),
+    st.builds(lambda a, b: spaces.MultiDiscrete([[a, b], [b, a]]), st.integers(1, 5), st.integers(1, 5)),
+    st.builds(spaces.MultiBinary, st.one_of(st.integers(1, 6), st.tuples(st.integers(1, 3), st.integers(1, 3)))),
+    st.builds(lambda low, n: spaces.Box(low, low + n, (2, 2), dtype=np.int32), st.integers(-4, 4), st.integers(0, 5)),
+    st.just(spaces.Box(np.zeros(3, dtype=np.bool_), np.ones(3, dtype=np.bool_), dtype=np.bool_)),
+)
+NESTED: st.SearchStrategy[spaces.Space[Any]] = st.recursive(
+    ELEMENTARY,
+    lambda inner: st.one_of(
+        st.builds(spaces.Tuple, st.lists(inner, min_size=1, max_size=3)),
+        st.builds(spaces.Dict, st.dictionaries(st.sampled_from("abc"), inner, min_size=1, max_size=3)),
+    ),
+    max_leaves=5,
+)
+
+
+def same(one: Any, other: Any) -> bool:
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    return one.dtype == other.dtype and np.array_equal(one, other)
+
+
+@given(space=NESTED, seed=st.integers(0, 1000))
+@settings(max_examples=60, deadline=None)
+def test_encoding_and_decoding_are_exact_inverses(space: spaces.Space[Any], seed: int) -> None:
+    factored = FactoredSpace(space)
+    batched = batch_space(space, 4)
+    batched.seed(seed)
+    batch = batched.sample()
+    factors = factored.encode(batch)
+    assert factors.shape == (4, len(factored))
+    assert (factors >= 0).all()
+    assert (factors < factored.cardinalities).all()
+    assert same(factored.decode(factors), batch)
+    np.testing.assert_array_equal(factored.encode(factored.decode_wide(factors)), factors)
+    assert len(factored.names) == len(set(factored.names)) == len(factored)
+
+
+@pytest.mark.parametrize(
+    "space", [spaces.Discrete(4, start=2), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary((2, 2))], ids=str
+)
+def test_every_joint_action_has_a_number(space: spaces.Space[Any]) -> None:
+    actions = ActionEnumeration(space)
+    numbers = np.arange(actions.n)
+    batch = actions.decode(numbers)
+    assert all(space.contains(action) for action in batch)
+    np.testing.assert_array_equal(actions.encode(batch), numbers)
+
+
+@pytest.mark.parametrize(
+    ("space", "kind", "error", "message"),
+    [
+        (spaces.Box(0.0, 1.0, (2,)), "observation", TypeError, "DiscretizeObservation"),
+        (spaces.Dict({"a": spaces.Discrete(2), "b": spaces.Box(0.0, 1.0)}), "observation", TypeError, "'b'"),
+        (spaces.Text(5), "observation", TypeError, "Text"),
+        (spaces.Box(-1.0, 1.0, (1,)), "action", TypeError, "DiscretizeAction"),
+        (spaces.Discrete(100_000), "observation", ValueError, "100000"),
+    ],
+)
+def test_unsupported_spaces_are_refused_with_the_way_out(
+    space: spaces.Space[Any], kind: str, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        FactoredSpace(space, kind)
+
+
+def test_too_many_joint_actions_are_refused() -> None:
+    with pytest.raises(ValueError, match="4096"):
+        ActionEnumeration(spaces.MultiBinary(13))
+
+
+@pytest.mark.parametrize("batch", [np.array([0, 5]), np.array([-1]), np.array([0.5]), np.zeros((2, 1)), np.array(1)])
+def test_values_outside_the_space_are_refused(batch: Any) -> None:
+    with pytest.raises(ValueError, match="observation"):
+        FactoredSpace(spaces.Discrete(5)).encode(batch)
+
+
+@pytest.mark.parametrize(
+    ("space", "expected"),
+    [
+        (spaces.MultiBinary((3, 6, 6)), (3, 6, 6, False)),
+        (spaces.Box(0, 9, (7, 7, 3), dtype=np.uint8), (3, 7, 7, True)),
+        (spaces.Box(0, 1, (4, 5), dtype=np.uint8), (1, 4, 5, False)),
+        (spaces.MultiBinary(9), None),
+        (spaces.MultiDiscrete([[2, 2], [2, 2]]), None),
+    ],
+)
+def test_planes_are_recognised(space: spaces.Space[Any], expected: tuple[int, int, int, bool] | None) -> None:
+    planes = FactoredSpace(space).planes
+    found = None if planes is None else (planes.channels, planes.height, planes.width, planes.channels_last)
+    assert found == expected
