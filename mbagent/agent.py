@@ -21,6 +21,7 @@ from mbagent.models.base import FitReport, TransitionModel
 from mbagent.models.factory import build_model
 from mbagent.planning.planner import PlannerSettings
 from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
+from mbagent.reporting import fit_progress, log_fit
 from mbagent.rewards import RewardFn
 from mbagent.saving import SavableAlgorithm
 from mbagent.spaces import ActionEnumeration, FactoredSpace
@@ -247,7 +248,7 @@ class ModelLearningAgent(SavableAlgorithm):
                 self.logger.dump(self.num_timesteps)
         self._recorder.flush()
         if len(self.transitions):
-            self._fit(self._recorder)
+            self._fit(self._recorder, progress_bar)
             if log_interval is not None:
                 self._log_rollout()
                 self.logger.dump(self.num_timesteps)
@@ -280,9 +281,10 @@ class ModelLearningAgent(SavableAlgorithm):
         callback.on_rollout_end()
         return True
 
-    def _fit(self, recorder: ExperienceRecorder) -> None:
+    def _fit(self, recorder: ExperienceRecorder, progress_bar: bool) -> None:
         """Fits the model, then works out goal and machine."""
-        report = self.model.fit(self.transitions, seed=self._planning_seed)
+        with fit_progress(progress_bar) as progress:
+            report = self.model.fit(self.transitions, seed=self._planning_seed, progress=progress)
         self._n_updates += 1
         self.fit_report = report
         starts = np.concatenate([self.policy.start_states, recorder.starts()])
@@ -291,22 +293,12 @@ class ModelLearningAgent(SavableAlgorithm):
         self.goals.forget_learned()
         began = time.perf_counter()
         self._refresh()
-        record = self.logger.record
-        losses = {"predictor_loss": report.predictor_loss, "conditioner_loss": report.conditioner_loss}
-        for name, value in {**losses, "exact_match": report.exact_match, "epochs": report.epochs}.items():
-            if value is not None:
-                record(f"train/{name}", value)
-        record("train/n_updates", self._n_updates, exclude="tensorboard")
-        record("train/fit_seconds", report.seconds)
-        record("model/transitions", len(self.transitions))
-        record("model/start_states", len(self.policy.start_states))
-        for name, value in report.log.items():
-            record(f"model/{name}", value)
+        log_fit(self.logger, report, self._n_updates, len(self.transitions), len(self.policy.start_states))
         if len(self.policy.start_states):
             plan = self.policy.plan(self.policy.start_states[:1])
-            record("plan/start_value", float(plan.values.max()))
-            record("plan/first_seconds", time.perf_counter() - began)
-            record("plan/goal", self.goals.source)
+            self.logger.record("plan/start_value", float(plan.values.max()))
+            self.logger.record("plan/first_seconds", time.perf_counter() - began)
+            self.logger.record("plan/goal", self.goals.source)
 
     def _log_rollout(self) -> None:
         seconds = max((time.time_ns() - self.start_time) / 1e9, 1e-9)

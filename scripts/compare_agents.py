@@ -1,6 +1,6 @@
 """Compares the model-learning agent with PPO, DQN and A2C; writes one HTML report and a table of all figures.
 
-python scripts/compare_agents.py            # quick: three trainings of each agent
+python scripts/compare_agents.py            # quick: two trainings of each agent
 python scripts/compare_agents.py --full     # five trainings, and baselines also at ten times the steps
 
 """
@@ -43,7 +43,7 @@ class Args:
     steps: int | None = None
     """Environment steps for learning; by default 50,000."""
     seeds: int | None = None
-    """Independent trainings of each agent; by default 3, with --full 5."""
+    """Independent trainings of each agent; by default 2, with --full 5."""
     episodes: int | None = None
     """Episodes after each training, more where there are few states; by default 10, with --full 20."""
     resume: bool = False

@@ -10,13 +10,14 @@ from pathlib import Path
 
 import gymnasium as gym
 import matplotlib as mpl
-import mbagent_envs
 import tyro
+
+import mbagent_envs
 from mbagent_envs.references import reference_policy
 
 mpl.use("Agg")
 
-from matplotlib import pyplot as plt  # noqa: E402 - after the choice of backend
+from matplotlib import pyplot as plt
 
 TITLES = {
     "mbagent/GeyserRunner-v0": "GeyserRunner: right pays, geysers hurt",

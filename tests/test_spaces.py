@@ -15,7 +15,7 @@ ELEMENTARY = st.one_of(
     st.builds(lambda a, b: spaces.MultiDiscrete([[a, b], [b, a]]), st.integers(1, 5), st.integers(1, 5)),
     st.builds(spaces.MultiBinary, st.one_of(st.integers(1, 6), st.tuples(st.integers(1, 3), st.integers(1, 3)))),
     st.builds(lambda low, n: spaces.Box(low, low + n, (2, 2), dtype=np.int32), st.integers(-4, 4), st.integers(0, 5)),
-    st.just(spaces.Box(np.zeros(3, dtype=np.bool_), np.ones(3, dtype=np.bool_), dtype=np.bool_)),
+    st.just(spaces.Box(np.zeros(3, dtype=np.bool_), np.ones(3, dtype=np.bool_), dtype=np.bool_)),  # type: ignore[arg-type],
 )
 NESTED: st.SearchStrategy[spaces.Space[Any]] = st.recursive(
     ELEMENTARY,
@@ -97,7 +97,7 @@ def test_values_outside_the_space_are_refused(batch: Any) -> None:
         (spaces.Box(0, 9, (7, 7, 3), dtype=np.uint8), (3, 7, 7, True)),
         (spaces.Box(0, 1, (4, 5), dtype=np.uint8), (1, 4, 5, False)),
         (spaces.MultiBinary(9), None),
-        (spaces.MultiDiscrete([[2, 2], [2, 2]]), None),
+        (spaces.MultiDiscrete(np.full((2, 2), 2)), None),
     ],
 )
 def test_planes_are_recognised(space: spaces.Space[Any], expected: tuple[int, int, int, bool] | None) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
@@ -38,25 +38,26 @@ class Settings:
         baseline_multiples: the baselines train for these multiples of the steps.
         curve_steps: the agent is also trained afresh for so many steps, for its learning curve.
         curve_seeds: trainings for each of these points.
-        goal_seeds: trainings on which the change-of-goal experiment is run.
+        goal_seeds: trainings on which new goals and the learned reward are tried.
         scale_episodes: episodes from which random play and references are measured.
         cases: keys of the cases.
     """
 
     steps: int = 50_000
-    seeds: int = 3
+    seeds: int = 2
     episodes: int = 10
-    goal_episodes: int = 5
+    goal_episodes: int = 4
     baseline_multiples: tuple[int, ...] = (1,)
     curve_steps: tuple[int, ...] = (1_000, 10_000)
     curve_seeds: int = 1
     goal_seeds: int = 1
-    scale_episodes: int = 1000
+    scale_episodes: int = 500
     cases: tuple[str, ...] = tuple(case.key for case in CASES)
 
 
 QUICK = Settings()
 FULL = Settings(
+    scale_episodes=2000,
     seeds=5,
     episodes=20,
     goal_episodes=20,
@@ -72,27 +73,31 @@ def plan_jobs(settings: Settings) -> list[Job]:
     jobs: list[Job] = []
     for case in map(find_case, settings.cases):
         steps = case.steps(settings.steps)
-        episodes = case.episodes * settings.episodes
         jobs.append(Job(REFERENCE, case.key, 0, 0, settings.scale_episodes, all_goals(case)))
         for seed in range(settings.seeds):
-            goals = all_goals(case) if seed < settings.goal_seeds else ("default",)
-            jobs += _jobs_of_seed(settings, case, seed, steps, episodes, goals)
+            jobs += _jobs_of_seed(settings, case, seed, steps)
     return sorted(jobs, key=lambda job: -_COST.get(job.agent, 0.0) * max(job.steps, settings.steps))
 
 
-def _jobs_of_seed(settings: Settings, case: Case, seed: int, steps: int, episodes: int, goals: tuple[str, ...]) -> list[Job]:
+def _jobs_of_seed(settings: Settings, case: Case, seed: int, steps: int) -> list[Job]:
+    episodes = case.episodes * settings.episodes
     agent = AGENT if case.reward_given else LEARNED_REWARD
-    jobs = [
-        Job(RANDOM, case.key, seed, 0, episodes),
-        Job(agent, case.key, seed, steps, episodes, goals, case.episodes * settings.goal_episodes),
-    ]
+    planned = Job(agent, case.key, seed, steps, episodes)
+    if seed < settings.goal_seeds:
+        fewer = case.episodes * settings.goal_episodes
+        planned = replace(planned, goals=all_goals(case), goal_episodes=fewer, learn_reward=case.reward_given)
+    jobs = [planned, Job(RANDOM, case.key, seed, 0, episodes)]
     if case.reward_given:
-        jobs.append(Job(TRUE_MODEL, case.key, seed, 0, episodes, goals, case.episodes * settings.goal_episodes))
+        jobs.append(replace(planned, agent=TRUE_MODEL, steps=0, learn_reward=False))
     jobs += [
         Job(name, case.key, seed, steps * multiple, episodes) for name in BASELINES for multiple in settings.baseline_multiples
     ]
     if seed < settings.curve_seeds:
-        jobs += [Job(agent, case.key, seed, fewer, episodes, curve=True) for fewer in settings.curve_steps if fewer < steps]
+        jobs += [
+            Job(agent, case.key, seed, fewer_steps, max(1, episodes // 2), curve=True)
+            for fewer_steps in settings.curve_steps
+            if fewer_steps < steps
+        ]
     return jobs
 
 

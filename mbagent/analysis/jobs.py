@@ -45,6 +45,7 @@ class Job:
         episodes: reporting episodes.
         goals: names of the goals to score.
         goal_episodes: reporting episodes for each goal but the default one.
+        learn_reward: whether the agent is scored once more with a reward learned from those it met.
         curve: whether this is only a point of the agent's learning curve.
     """
 
@@ -55,6 +56,7 @@ class Job:
     episodes: int
     goals: tuple[str, ...] = ("default",)
     goal_episodes: int = 0
+    learn_reward: bool = False
     curve: bool = False
 
     @property
@@ -182,7 +184,7 @@ def _learn_and_plan(job: Job, case: Case, report: Report | None) -> list[Record]
     seconds = time.perf_counter() - start
     planning = None if report is None else _part(report, 1, 2)
     records = _score_goals(job, case, agent, seconds, planning)
-    if case.reward_given and not job.curve:
+    if job.learn_reward:
         records += _learn_reward_too(job, case, agent, seconds)
     return records
 

@@ -2,6 +2,7 @@
 
 from mbagent.models.base import BaseTransitionModel, FitReport, Successors, TransitionModel
 from mbagent.models.config import NeuralConfig
+from mbagent.models.factory import build_model, register_model
 from mbagent.models.networks import Conditioner, DensePredictor, FactorCodec, Predictor
 from mbagent.models.neural import NeuralTransitionModel
 from mbagent.models.planes import PlanePredictor
@@ -24,4 +25,6 @@ __all__ = [
     "TabularModel",
     "TrainingConfig",
     "TransitionModel",
+    "build_model",
+    "register_model",
 ]

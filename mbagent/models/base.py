@@ -11,13 +11,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.transitions import TransitionDataset
 from mbagent_envs.random_keys import derive
+
+if TYPE_CHECKING:
+    from mbagent.models.reachable import ReachableMDP
 
 States: TypeAlias = NDArray[np.int64]
 Actions: TypeAlias = NDArray[np.int64]
@@ -141,7 +144,23 @@ class BaseTransitionModel(ABC):
         self.n_actions = int(n_actions)
 
     @abstractmethod
+    def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
+        """See TransitionModel."""
+
+    @abstractmethod
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
+        """See TransitionModel."""
+
+    @abstractmethod
+    def marginals(self, states: States, actions: Actions) -> Floats:
+        """See TransitionModel."""
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, NDArray[Any]]:
+        """See TransitionModel."""
+
+    @abstractmethod
+    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
         """See TransitionModel."""
 
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
@@ -164,6 +183,12 @@ class BaseTransitionModel(ABC):
         rows = np.repeat(np.arange(len(states)), n_samples)
         next_states, terminated = self.sample(states[rows], actions[rows], np.tile(keys, len(states)))
         return merge_draws(rows, len(states), next_states, terminated, np.full(len(rows), 1.0 / n_samples))
+
+    def reachable_mdp(self, start: States, max_states: int = 10_000, n_samples: int = 32, seed: int = 0) -> ReachableMDP:
+        """The finite-state machine reachable from ``start`` int64 [B, F]; see ``reachable.reachable_mdp``."""
+        from mbagent.models.reachable import reachable_mdp  # noqa: PLC0415 - reachable.py builds on this module
+
+        return reachable_mdp(self, start, max_states, n_samples, seed)
 
     def moments(
         self,

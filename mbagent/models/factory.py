@@ -9,6 +9,7 @@ from mbagent.models.base import TransitionModel
 from mbagent.models.config import NeuralConfig
 from mbagent.models.neural import NeuralTransitionModel
 from mbagent.models.planes import PlanePredictor
+from mbagent.models.tabular import TabularModel
 from mbagent.models.training import TrainingConfig
 from mbagent.spaces import FactoredSpace
 
@@ -44,7 +45,13 @@ def build_paper(space: FactoredSpace, n_actions: int, learning_rate: float) -> T
     )
 
 
-_FACTORIES: dict[str, ModelFactory] = {"auto": build_auto, "paper": build_paper}
+def build_tabular(space: FactoredSpace, n_actions: int, learning_rate: float) -> TransitionModel:
+    """Counts of what was seen; nothing carries over to unseen states."""
+    del learning_rate
+    return TabularModel(space.cardinalities, n_actions)
+
+
+_FACTORIES: dict[str, ModelFactory] = {"auto": build_auto, "paper": build_paper, "tabular": build_tabular}
 
 
 def register_model(name: str, factory: ModelFactory) -> None:

@@ -28,7 +28,7 @@ from mbagent.models.networks import Conditioner, DensePredictor, FactorCodec
 from mbagent.models.packing import CompiledBody, compiled_body, pack_groups, pack_layout
 from mbagent.models.samplers import log_prob_causal, sample_causal, sample_independent, sample_sweeps
 from mbagent.models.systematic import causal_successors, independent_successors
-from mbagent.models.training import Examples, Trainer, as_examples, examples
+from mbagent.models.training import Examples, Trainer, as_examples, examples, one_thread
 from mbagent.transitions import TransitionDataset
 
 BodyFactory: TypeAlias = Callable[[FactorCodec, torch.Generator], nn.Module]
@@ -63,7 +63,8 @@ class NeuralTransitionModel(BaseTransitionModel):
         self._dropout = self.config.dropout_for(len(self.cardinalities))
         self._build(seed)
 
-    def _build(self, seed: int) -> None:
+    def _build(self, seed: int) -> torch.Generator:
+        """New networks; returns the generator that their weights came from."""
         config, generator = self.config, torch.Generator().manual_seed(seed)
         self.predictor: nn.Module
         if self._body is not None:
@@ -76,6 +77,7 @@ class NeuralTransitionModel(BaseTransitionModel):
             self.conditioner = self._new_conditioner(None, generator)
         self._online: torch.optim.Optimizer | None = None
         self._changed()
+        return generator
 
     def _new_conditioner(self, grouped: torch.Tensor | None, generator: torch.Generator) -> Conditioner:
         config = self.config
@@ -95,17 +97,16 @@ class NeuralTransitionModel(BaseTransitionModel):
         self._forward: CompiledBody | None = None
         self._groups: GroupWeights | None = None
 
+    @one_thread()
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel; fits anew from first weights that depend on ``seed`` only.
 
-        The predictor is fitted first; then the conditioner, with groups for those factors that the predictor leaves
-        open.
+        The predictor is fitted first; then the conditioner, with groups for the factors that the predictor leaves open.
         """
         began = time.perf_counter()
-        self._build(seed)
+        generator = self._build(seed)
         train_rows, held_out_rows = data.split(self.config.training.validation, seed)
         train, held_out = examples(train_rows), examples(held_out_rows)
-        generator = torch.Generator().manual_seed(seed + 1)
         trainer = Trainer(self.codec, self.predictor, None, self.config.training)
         half = progress if progress is None or self.conditioner is None else lambda share: progress(0.5 * share)
         epochs = trainer.fit(train, held_out, generator, half)
@@ -151,6 +152,7 @@ class NeuralTransitionModel(BaseTransitionModel):
         weights = rows.weights.numpy()
         return float(np.average((likeliest == outcomes).all(axis=1), weights=weights)) if len(weights) else 1.0
 
+    @one_thread()
     def observe(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> None:
         """The paper's on-line method: one gradient step with each observation's own outcome as target.
 

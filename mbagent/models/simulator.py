@@ -54,7 +54,7 @@ class SimulatorModel(BaseTransitionModel):
         return np.ascontiguousarray(states, dtype=np.int8).reshape(len(states), *self._shape)
 
     def _factors(self, observations: NDArray[np.int8]) -> States:
-        return observations.reshape(len(observations), -1).astype(np.int64)
+        return observations.reshape(len(observations), len(self.cardinalities)).astype(np.int64)
 
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
         """See TransitionModel."""

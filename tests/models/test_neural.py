@@ -7,6 +7,7 @@ import torch
 
 from mbagent.models import DensePredictor, FactorCodec, NeuralConfig, NeuralTransitionModel, TrainingConfig
 from mbagent.models.networks import Mask
+from mbagent.transitions import TransitionDataset
 from mbagent_envs.geyser_runner import GeyserRunner
 from mbagent_envs.random_keys import derive
 from tests.models.helpers import (
@@ -20,7 +21,6 @@ from tests.models.helpers import (
     random_rows,
     scrambled,
 )
-from mbagent.transitions import TransitionDataset
 
 Ints = np.ndarray
 
@@ -193,7 +193,11 @@ def test_a_fit_depends_on_its_seed_alone_and_leaves_the_process_wide_generators_
     torch.random.manual_seed(1)
     np.random.seed(1)  # noqa: NPY002 (that it does not matter is the question)
     torch_state, numpy_state = torch.random.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(2)
     second = weights(5, 1)
+    assert torch.get_num_threads() == 2
+    torch.set_num_threads(n_threads)
     assert torch.equal(torch_state, torch.random.get_rng_state())
     assert np.array_equal(numpy_state, np.random.get_state()[1])  # noqa: NPY002
     assert all(array.tobytes() == second[name].tobytes() for name, array in first.items())

@@ -34,8 +34,7 @@ def test_successors_are_what_sampling_gives(game: Game) -> None:
     states, actions = met(game)
     found = model.successors(states, actions, 16, seed=0)
     assert np.bincount(found.rows, weights=found.probabilities) == pytest.approx(np.ones(len(states)))
-    listed = ~(game.name_of_redraw(states) if hasattr(game, "name_of_redraw") else np.zeros(len(states), dtype=np.bool_))
-    for row in np.flatnonzero(listed)[:10]:
+    for row in range(10):
         span = slice(found.offsets[row], found.offsets[row + 1])
         if isinstance(game, Maneuverer) and span.stop - span.start > 1:
             continue  # a new layout: too many to list
@@ -50,7 +49,9 @@ def test_marginals_and_log_probabilities_are_exact() -> None:
     game = GeyserRunner(width=10)
     model = SimulatorModel(game)
     states, actions = met(game)
-    assert model.marginals(states, actions).reshape(len(states), -1, 2)[:, 10:, 1] == pytest.approx(np.full((len(states), 5), 0.2))
+    assert model.marginals(states, actions).reshape(len(states), -1, 2)[:, 10:, 1] == pytest.approx(
+        np.full((len(states), 5), 0.2)
+    )
     following, ends = model.sample(states, actions, np.random.default_rng(0))
     assert model.log_prob(states, actions, following, ends) == pytest.approx(np.full(len(states), np.log(0.2)))
     assert np.isneginf(model.log_prob(states, actions, following, ~ends)).all()

@@ -28,7 +28,11 @@ def test_probabilities_are_the_frequencies_met() -> None:
     n = len(ends)
     probabilities = np.exp(model.log_prob(np.zeros((n, 2), dtype=np.int64), np.zeros(n, dtype=np.int64), following, ends))
     expected = np.zeros(n)
-    expected[outcome_numbers(CARDINALITIES, np.array([[1, 1], [2, 0], [0, 0]]), np.array([False, False, True]))] = [3 / 6, 2 / 6, 1 / 6]
+    expected[outcome_numbers(CARDINALITIES, np.array([[1, 1], [2, 0], [0, 0]]), np.array([False, False, True]))] = [
+        3 / 6,
+        2 / 6,
+        1 / 6,
+    ]
     assert probabilities == pytest.approx(expected)
     assert model.marginals(*one_row())[0] == pytest.approx([1 / 6, 3 / 6, 2 / 6, 3 / 6, 3 / 6])
     found = model.successors(*one_row(), 4, seed=0)

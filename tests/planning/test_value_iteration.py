@@ -1,11 +1,13 @@
 import numpy as np
 import pytest
 
+from mbagent.models import SimulatorModel
 from mbagent.models.reachable import grow_reachable
 from mbagent.models.state_graph import StateGraph
 from mbagent.planning.machine_planner import MachinePlanner
 from mbagent.planning.planner import PlannerSettings
 from mbagent.planning.value_iteration import solve
+from mbagent_envs.geyser_runner import GeyserRunner
 from tests.worlds import TableWorld, arrival_goal, optimal_q, random_table
 
 
@@ -67,3 +69,20 @@ def test_start_states_beyond_the_budget_give_no_machine_but_a_plan() -> None:
     planner.set_model(world, np.array([[0]]))
     planner.set_goal(arrival_goal(np.arange(40.0)))
     assert planner.plan(np.array([[0], [7]])).values.shape == (2, 2)
+
+
+def test_the_machine_of_the_true_geyser_runner_is_exact() -> None:
+    # 50 states: every transition probability, and the optimum the design states for a high cost.
+    game = GeyserRunner(hit_cost=5.0)
+    model = SimulatorModel(game)
+    mdp = model.reachable_mdp(model.start_states(64))
+    assert mdp.complete
+    assert mdp.states.shape == (50, 15)
+    assert (np.diff(mdp.offsets, axis=1) == 5).all()
+    np.testing.assert_allclose(mdp.probabilities, 0.2)
+    assert not mdp.terminated.any()
+    position = mdp.states[:, :10].argmax(axis=1)
+    for state, action in np.ndindex(50, 3):
+        part = slice(mdp.offsets[state, action], mdp.offsets[state, action + 1])
+        assert set(position[mdp.next_states[part]]) == {int(np.clip(position[state] + action - 1, 0, 9))}
+        assert len(set(mdp.next_states[part])) == 5

@@ -1,0 +1,60 @@
+"""What a fit shows while it runs, and what it leaves in the log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from stable_baselines3.common.logger import Logger
+
+from mbagent.models.base import FitReport
+
+
+@contextmanager
+def fit_progress(show: bool) -> Iterator[Callable[[float], None] | None]:
+    """A function to tell the share of a fit that is done, shown as a bar; None without ``show``.
+
+    Raises:
+        ImportError: tqdm is missing; the message names the pip line.
+    """
+    if not show:
+        yield None
+        return
+    try:
+        from tqdm.auto import tqdm  # noqa: PLC0415 - optional
+    except ImportError as error:
+        raise ImportError('progress_bar=True needs tqdm: pip install "mbagent[progress]".') from error
+    with tqdm(total=100, desc="fitting the model", unit="%") as bar:
+
+        def tell(share: float) -> None:
+            bar.update(round(100 * share) - bar.n)
+
+        yield tell
+        bar.update(100 - bar.n)
+
+
+def log_fit(logger: Logger, report: FitReport, n_updates: int, n_transitions: int, n_start_states: int) -> None:
+    """Writes the ``train/`` and ``model/`` figures of a fit to the log.
+
+    Args:
+        logger: SB3's logger.
+        report: what the fit did.
+        n_updates: fits so far.
+        n_transitions: transitions met so far.
+        n_start_states: distinct start states known.
+    """
+    figures = {
+        "predictor_loss": report.predictor_loss,
+        "conditioner_loss": report.conditioner_loss,
+        "exact_match": report.exact_match,
+        "epochs": report.epochs,
+        "fit_seconds": report.seconds,
+    }
+    for name, value in figures.items():
+        if value is not None:
+            logger.record(f"train/{name}", value)
+    logger.record("train/n_updates", n_updates, exclude="tensorboard")
+    logger.record("model/transitions", n_transitions)
+    logger.record("model/start_states", n_start_states)
+    for name, value in report.log.items():
+        logger.record(f"model/{name}", value)
