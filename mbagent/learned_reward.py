@@ -14,6 +14,7 @@ from torch.nn import functional
 from mbagent.models.base import Actions, Floats, States, hash_rows
 from mbagent.models.networks import Affine, FactorCodec
 from mbagent.models.planes import Convolution, cells_of
+from mbagent.models.threads import one_thread
 from mbagent.spaces import PlaneLayout
 from mbagent.transitions import TransitionBatch
 
@@ -50,6 +51,7 @@ class LearnedReward:
         else:
             self._network = _DenseReward(self._codec, n_out, generator)
 
+    @one_thread()
     def fit(self, rows: TransitionBatch) -> float:
         """Learns from rows; returns the share of them whose reward comes out right (within 0.5% of the range)."""
         values = np.unique(rows.rewards)
@@ -84,6 +86,7 @@ class LearnedReward:
             (losses * weights[i]).mean().backward()  # type: ignore[no-untyped-call]
             optimizer.step()
 
+    @one_thread()
     @torch.inference_mode()
     def __call__(self, states: States, actions: Actions, next_states: States) -> Floats:
         """Expected rewards float64 [M]; a row's value does not depend on the rows beside it."""

@@ -9,13 +9,14 @@ from hypothesis import strategies as st
 
 from mbagent.spaces import ActionEnumeration, FactoredSpace
 
+BOOLEAN_BOX = spaces.Box(np.zeros(3, np.bool_), np.ones(3, np.bool_), dtype=np.bool_)  # type: ignore[arg-type]
 ELEMENTARY = st.one_of(
     st.builds(lambda n, start: spaces.Discrete(n, start=start), st.integers(1, 9), st.integers(-5, 5)),
     st.builds(spaces.MultiDiscrete, st.lists(st.integers(1, 5), min_size=1, max_size=4)),
-    st.builds(lambda a, b: spaces.MultiDiscrete([[a, b], [b, a]]), st.integers(1, 5), st.integers(1, 5)),
+    st.builds(lambda a, b: spaces.MultiDiscrete(np.array([[a, b], [b, a]])), st.integers(1, 5), st.integers(1, 5)),
     st.builds(spaces.MultiBinary, st.one_of(st.integers(1, 6), st.tuples(st.integers(1, 3), st.integers(1, 3)))),
     st.builds(lambda low, n: spaces.Box(low, low + n, (2, 2), dtype=np.int32), st.integers(-4, 4), st.integers(0, 5)),
-    st.just(spaces.Box(np.zeros(3, dtype=np.bool_), np.ones(3, dtype=np.bool_), dtype=np.bool_)),  # type: ignore[arg-type],
+    st.just(BOOLEAN_BOX),
 )
 NESTED: st.SearchStrategy[spaces.Space[Any]] = st.recursive(
     ELEMENTARY,

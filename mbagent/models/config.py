@@ -22,10 +22,8 @@ class NeuralConfig:
         correction: whether the conditioner's output is added to the predictor's logits.
         certain: a factor whose likeliest value has this probability in the predictor's eyes is left to the predictor.
         dropout: share of hidden nodes zeroed in each training step; without it, networks learn the noise of rare
-            states.
-            None: 0.4, or 0 where the state is a single factor: what states have in common is not in their columns
-                then, the
-            network is a table, and dropout only blurs it.
+            states. None: 0.4, or 0 where the state is a single factor: its columns show nothing that states have in
+            common, the network is a table then, and dropout only blurs it.
         sweeps: passes over all factors, mask "others".
         real_guess: whether the first guess is the predictor's probabilities rather than bits drawn from them.
         training: see TrainingConfig.

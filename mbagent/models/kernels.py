@@ -1,10 +1,8 @@
 """Compiled inference: the networks of ``networks.py`` evaluated row by row (``samplers.py`` draws with them).
 
-Torch trains; here each row is computed by itself, in one fixed order of operations. So a row's result is the same to
-the
-last bit alone and in any batch, which matrix products do not promise, and inputs that are 0 cost nothing. Shapes: B
-batch, F
-state factors, O = F + 1 output factors, K largest cardinality, G hidden nodes in a group.
+Torch trains; here each row is computed by itself, in one fixed order of operations. So a row's result is the same
+to the last bit alone and in any batch, which matrix products do not promise, and inputs that are 0 cost nothing.
+Shapes: B batch, F state factors, O = F + 1 output factors, K largest cardinality, G hidden nodes in a group.
 """
 
 from __future__ import annotations

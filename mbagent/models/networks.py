@@ -1,9 +1,8 @@
 """The two networks of the paper's section 3: the predictor (3.1) and the conditioner with grouped hidden nodes (3.2).
 
-The paper's variables are bits; here a variable is a *factor* with any number of values (a bit is a factor with two),
-and
-termination is one more output factor, the last. Shapes: B batch, F state factors, O = F + 1 output factors, K largest
-cardinality, G hidden nodes in a group.
+The paper's variables are bits; here a variable is a *factor* with any number of values (a bit is a factor with
+two), and termination is one more output factor, the last. Shapes: B batch, F state factors, O = F + 1 output
+factors, K largest cardinality, G hidden nodes in a group.
 """
 
 from __future__ import annotations
@@ -221,10 +220,9 @@ class Conditioner(nn.Module):
     """The conditioner network (paper 3.2): output i is the distribution of y_i given (s, a) and other next factors.
 
     One hidden layer in groups, one group an output. Group i sees (s, a) and, of the next factors, y_<i (mask
-    "causal") or all
-    but y_i (mask "others"); output i reads group i and nothing else, so nothing of y_i reaches output i. Outputs
-    that the
-    predictor leaves no doubt about need no group: their logits are 0 here, and nothing is added to the predictor's.
+    "causal") or all but y_i (mask "others"); output i reads group i and nothing else, so nothing of y_i reaches
+    output i. Outputs that the predictor leaves no doubt about need no group: their logits are 0 here, and nothing
+    is added to the predictor's.
 
     Args:
         codec: the factors.

@@ -1,16 +1,13 @@
 """Successors for planning: systematic draws through the ancestral inverse distribution function, equal ones merged.
 
-A row starts as one *particle* that holds the n grid points (j + offset) / n of [0, 1). At each factor the particle's
-interval
-is split in proportion to P(y_i | s, a, y_<i) and its points go to the parts; parts without a point are dropped. So work
-grows with the number of different outcomes and not with n, no outcome of probability 1 / n or more is missed, and an
-outcome's share of the points is within 1 / n of its probability. The offset is the same for all rows: two actions,
-or two
-states, differ by their effects and not by luck. A particle down to a single point goes on with fresh numbers, hashed
-from
-(seed, point, factor), for its interval would soon be too narrow for a float. Shapes: B batch, F state factors, O = F
-+ 1
-output factors, K largest cardinality, n points a row, M successors.
+A row starts as one *particle* that holds the n grid points (j + offset) / n of [0, 1). At each factor the
+particle's interval is split in proportion to P(y_i | s, a, y_<i) and its points go to the parts; parts without a
+point are dropped. So work grows with the number of different outcomes and not with n, no outcome of probability 2 /
+n or more is missed, and an outcome's expected share of the points is its probability. The offset is the same for
+all rows: two actions, or two states, differ by their effects and not by luck. A particle down to a single point
+goes on with fresh numbers, hashed from (seed, point, factor), for its interval would soon be too narrow for a
+float. Shapes: B batch, F state factors, O = F + 1 output factors, K largest cardinality, n points a row, M
+successors.
 """
 
 from __future__ import annotations

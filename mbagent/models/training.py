@@ -40,8 +40,7 @@ class TrainingConfig:
         patience: stop after this many checks without a better held-out loss.
         loss: "cross_entropy", or "squared" as in the paper.
         negligible: a factor whose held-out cross-entropy under the predictor is below this many nats gets no group
-            in the
-            conditioner.
+            in the conditioner.
         online_learning_rate: Adam's, in the on-line method.
     """
 
@@ -129,8 +128,7 @@ class Trainer:
     """Fits a predictor and then a conditioner to examples, or both to one observation after another.
 
     The conditioner's loss never reaches the predictor, so the order does not matter to the predictor; a conditioner
-    that
-    corrects a finished predictor has a fixed thing to correct.
+    that corrects a finished predictor has a fixed thing to correct.
 
     Args:
         codec: the factors.

@@ -7,7 +7,7 @@ from mbagent.models.systematic import ancestral_successors, independent_successo
 from mbagent.models.thinning import thin
 from tests.models.helpers import MIXED, Floats, Ints, distribution, outcome_numbers, outcomes, random_rows, scrambled
 
-CONFIGS = [NeuralConfig(hidden=(8,), group_size=4, conditioner=mask) for mask in ("causal", None)]  # type: ignore[arg-type]
+CONFIGS = [NeuralConfig(hidden=(8,), group_size=4, conditioner=mask) for mask in ("causal", None)]
 
 
 def rows_of(found: Successors, cardinalities: tuple[int, ...] = MIXED) -> list[dict[int, float]]:
@@ -82,7 +82,8 @@ def test_compiled_and_general_procedure_find_the_same(config: NeuralConfig, n: i
     tables, outputs = conditionals(model, states, actions), np.asarray((*MIXED, 2))
 
     def conditional(i: int, row: Ints, factors: Ints) -> Floats:
-        return tables[i][(row, *factors[:, :i].T)]
+        found: Floats = tables[i][(row, *factors[:, :i].T)]
+        return found
 
     found = rows_of(model.successors(states, actions, n, seed=5))
     general = rows_of(ancestral_successors(30, outputs, conditional, n, seed=5))
