@@ -79,7 +79,7 @@ class ModelLearningAgent(SavableAlgorithm):
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None,
-        learning_rate: float | Schedule = 0.01,
+        learning_rate: float | Schedule = 0.02,
         *,
         reward: RewardFn | None = None,
         model: str | TransitionModel = "auto",

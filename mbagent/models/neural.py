@@ -99,7 +99,10 @@ class NeuralTransitionModel(BaseTransitionModel):
 
     @one_thread()
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
-        """See TransitionModel; fits anew from first weights that depend on ``seed`` only.
+        """See TransitionModel; fits anew from first weights that depend on ``seed`` only, whatever was fitted before.
+
+        Going on from the weights of an earlier fit was measured, too: it takes half the time or less, but ends 0.001 to
+        0.003 nats a transition worse than fitting anew to all the data, and depends on what was fitted before.
 
         The predictor is fitted first; then the conditioner, with groups for the factors that the predictor leaves open.
         """

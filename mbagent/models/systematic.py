@@ -90,15 +90,14 @@ def _causal(
     key: np.uint64,
     offset: float,
 ) -> Found:
-    n_rows, n_outputs = probs.shape[0], probs.shape[1]
-    p, found = new_particles(n_grid, n_outputs), room(n_rows, n_grid, n_outputs)
-    base, still_open = np.empty(n_outputs, dtype=np.int64), np.empty(n_outputs, dtype=np.int64)
-    active, columns = np.empty(n_outputs + 1, dtype=np.int64), np.empty(n_outputs, dtype=np.int64)
-    known = np.empty(group.bias.shape[1], dtype=np.float32)
-    hidden, row_logits = np.empty_like(known), np.empty(probs.shape[2], dtype=np.float32)
-    values = np.empty(probs.shape[2], dtype=np.float64)
-    total = 0
-    for b in range(n_rows):
+    n_outputs = probs.shape[1]
+    p, found = new_particles(n_grid, n_outputs), room(len(states), n_grid, n_outputs)
+    base, still_open, columns = np.empty((3, n_outputs), dtype=np.int64)
+    active = np.empty(n_outputs + 1, dtype=np.int64)
+    known, hidden = np.empty((2, group.bias.shape[1]), dtype=np.float32)
+    row_logits = np.empty(probs.shape[2], dtype=np.float32)
+    values, total = np.empty(probs.shape[2], dtype=np.float64), 0
+    for b in range(len(states)):
         n_active = active_columns(states, b, actions[b], layout, active)
         n_live, n_open = begin(p, n_grid), 0
         settle(probs, b, layout.outputs, base)
@@ -106,13 +105,9 @@ def _causal(
             n, trust = layout.outputs[i], group.group_of[i] < 0 or trusted(probs, b, i, layout, group, certain)
             if trust and base[i] >= 0:
                 continue
-            base[i] = -1
-            still_open[n_open] = i
+            base[i], still_open[n_open] = -1, i
             if not trust:
-                g = group.group_of[i]
-                known[:] = group.bias[g]
-                add_columns(group.inputs, g, active, n_active, known)
-                add_columns(group.others, g, columns, _settled_columns(base, i, layout, columns), known)
+                _known_input(i, base, active, n_active, layout, group, columns, known)
             for q in range(n_live):
                 if trust:
                     values[:] = probs[b, i]
@@ -131,14 +126,18 @@ def _causal(
 
 
 @compiled
-def _settled_columns(base: Ints, i: int, layout: Layout, columns: Ints) -> int:
-    """Writes the columns that are 1 by factors before i that all of the row's particles share; returns how many."""
-    n = 0
+def _known_input(
+    i: int, base: Ints, active: Ints, n_active: int, layout: Layout, group: GroupWeights, columns: Ints, known: Floats32
+) -> None:
+    """Writes what factor i's group gets in all particles of a row: from (s, a), and from earlier factors that they share."""
+    g, n = group.group_of[i], 0
     for j in range(i):
         if base[j] >= 0 and (layout.outputs[j] != 2 or base[j] == 1):
             columns[n] = layout.start[j] + (0 if layout.outputs[j] == 2 else base[j])
             n += 1
-    return n
+    known[:] = group.bias[g]
+    add_columns(group.inputs, g, active, n_active, known)
+    add_columns(group.others, g, columns, n, known)
 
 
 @compiled

@@ -1,0 +1,90 @@
+"""Writes the table of results that the README shows, from the results.csv of a comparison.
+
+python scripts/results_table.py --results results/compare/results.csv
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from mbagent.analysis.cases import CASES
+from mbagent.analysis.records import AGENT, LEARNED_REWARD, TRUE_MODEL
+from mbagent.analysis.statistics import interquartile_mean
+
+COLUMNS = {"learned model": AGENT, "reward learned too": LEARNED_REWARD, "true model": TRUE_MODEL}
+BASELINES = ("PPO", "DQN", "A2C")
+
+
+@dataclass(frozen=True)
+class Args:
+    """Write the README's table of results."""
+
+    results: Path = Path("results/compare/results.csv")
+    """What a comparison wrote."""
+    baselines: Path | None = None
+    """Where the baselines' rows are, if in another file."""
+    readme: Path = Path("README.md")
+    """The table goes between the two marks <!-- results --> in this file."""
+
+
+Scores = dict[tuple[str, str, str], list[float]]
+
+
+def read(path: Path) -> Scores:
+    """Normalised return of each training by (case, agent, goal); points of learning curves and longer trainings left out."""
+    scores: Scores = defaultdict(list)
+    steps: dict[tuple[str, str, str], int] = {}
+    with path.open(encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            key, n = (row["case"], row["agent"], row["goal"]), int(row["environment_steps"])
+            if row["curve_point"] in ("1", "True") or n > steps.setdefault(key, n):
+                continue
+            scores[key].append(float(row["normalised_return"]))
+    return scores
+
+
+def score(values: Sequence[float]) -> str:
+    """Interquartile mean over trainings, to two digits."""
+    return f"{float(interquartile_mean(values)):.2f}" if values else "–"
+
+
+def new_goals(scores: Scores, case: str) -> str:
+    """The lowest share, over the new goals of a case, of the true model's score that the learned model reaches."""
+    goals = {goal for found, agent, goal in scores if found == case and agent == TRUE_MODEL and goal != "default"}
+    shares = [
+        float(interquartile_mean(scores[case, AGENT, goal]) / interquartile_mean(scores[case, TRUE_MODEL, goal]))
+        for goal in goals
+    ]
+    return f"{min(shares):.2f}" if shares else "–"
+
+
+def table(scores: Scores, others: Scores) -> str:
+    """The table, as Markdown."""
+    names = [*COLUMNS, *BASELINES, "worst new goal"]
+    lines = ["| | " + " | ".join(names) + " |", "| --- |" + " ---: |" * len(names)]
+    for case in CASES:
+        cells = [score(scores.get((case.key, agent, "default"), [])) for agent in COLUMNS.values()]
+        cells += [score(others.get((case.key, agent, "default"), [])) for agent in BASELINES]
+        lines.append(f"| {case.title} | " + " | ".join([*cells, new_goals(scores, case.key)]) + " |")
+    return "\n".join(lines)
+
+
+def main(args: Args) -> None:
+    """Writes the table into the README."""
+    scores = read(args.results)
+    others = read(args.baselines) if args.baselines else scores
+    mark = "<!-- results -->"
+    text = args.readme.read_text(encoding="utf-8")
+    filled = re.sub(f"{mark}.*{mark}", f"{mark}\n{table(scores, others)}\n{mark}", text, flags=re.DOTALL)
+    args.readme.write_text(filled, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args, description=__doc__))
