@@ -226,8 +226,8 @@ def _value_range(space: spaces.Space[Any], path: tuple[str | int, ...], kind: st
     where = f" part {'.'.join(map(str, path))!r}" if path else ""
     if isinstance(space, spaces.Box) and kind == "observation":
         if space.dtype is not None and np.dtype(space.dtype).kind in "iub":
-            low = space.low.ravel().astype(np.int64)
-            return low, [int(n) for n in space.high.ravel().astype(np.int64) - low + 1]
+            bounds = zip(space.low.ravel().tolist(), space.high.ravel().tolist(), strict=True)  # Python's integers: no overflow
+            return space.low.ravel().astype(np.int64), [int(high) - int(low) + 1 for low, high in bounds]
         raise TypeError(
             f"The observation space{where} {space} is continuous, and this agent models discrete variables; "
             "wrap the environment with gymnasium.wrappers.DiscretizeObservation."

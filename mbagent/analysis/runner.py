@@ -61,7 +61,9 @@ def run_jobs(jobs: Sequence[Job], folder: Path, *, workers: int, console: Consol
             records.extend(outcome.records)
             if outcome.error:
                 failures.append(outcome)
-                console.print(f"[red]failed[/red]  {outcome.job.name}", highlight=False, soft_wrap=True)
+                reason = outcome.error.strip().splitlines()[-1]
+                line = f"failed  {outcome.job.name}: {reason}"
+                console.print(line, style="red", highlight=False, markup=False, soft_wrap=True)
             else:
                 console.print(_line(board, outcome), highlight=False, soft_wrap=True)
     if failures:
