@@ -71,6 +71,7 @@ def test_every_joint_action_has_a_number(space: spaces.Space[Any]) -> None:
         (spaces.Text(5), "observation", TypeError, "Text"),
         (spaces.Box(-1.0, 1.0, (1,)), "action", TypeError, "DiscretizeAction"),
         (spaces.Discrete(100_000), "observation", ValueError, "100000"),
+        (spaces.Box(-(2**63), 2**63 - 1, (1,), dtype=np.int64), "observation", ValueError, str(2**64)),
     ],
 )
 def test_unsupported_spaces_are_refused_with_the_way_out(

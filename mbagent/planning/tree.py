@@ -45,6 +45,21 @@ def empty_paths(n_roots: int, wave: int, horizon: int) -> Paths:
 
 
 @compiled
+def choose(node: int, q: Floats, visits: Floats, prior_visits: float, weight: float) -> int:
+    """The action of ``node`` with the greatest upper confidence bound; one never tried goes first."""
+    total = prior_visits * q.shape[1] + visits[node].sum()
+    best, chosen = -np.inf, 0
+    for a in range(q.shape[1]):
+        seen = prior_visits + visits[node, a]
+        score = np.inf
+        if seen > 0.0:
+            score = q[node, a] + weight * np.sqrt(np.log(total + 1.0) / seen)
+        if score > best:
+            best, chosen = score, a
+    return chosen
+
+
+@compiled
 def select(
     roots: Ints,
     expanded: Bools,
@@ -72,7 +87,6 @@ def select(
     in ``back_up`` ("watch the unobserved", Liu et al. 2020). The luck of simulation k is the same for every root.
     """
     n_roots, wave, horizon = edges.shape
-    n_actions = q.shape[1]
     for r in range(n_roots):
         for w in range(wave):
             node, length, leaf = roots[r], 0, -1
@@ -80,15 +94,7 @@ def select(
                 if not expanded[node]:
                     leaf = node
                     break
-                total = prior_visits * n_actions + visits[node].sum()
-                best, chosen = -np.inf, 0
-                for a in range(n_actions):
-                    seen = prior_visits + visits[node, a]
-                    score = np.inf
-                    if seen > 0.0:
-                        score = q[node, a] + c_uct * spans[r] * np.sqrt(np.log(total + 1.0) / seen)
-                    if score > best:
-                        best, chosen = score, a
+                chosen = choose(node, q, visits, prior_visits, c_uct * spans[r])
                 visits[node, chosen] += 1.0
                 luck = uniform_at(key, (first_simulation + w) * horizon + length)
                 edge = first[node, chosen]

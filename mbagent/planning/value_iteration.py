@@ -96,7 +96,50 @@ def settle(graph: StateGraph, values: Values, gamma: float, max_sweeps: int = MA
 
 
 @compiled
-def _sweep(  # noqa: C901 - one kernel: splitting it would hide the order of the sweep
+def _bellman(
+    s: int,
+    first: NDArray[np.int64],
+    count: NDArray[np.int64],
+    next_nodes: NDArray[np.int64],
+    weights: NDArray[np.float64],
+    mean_rewards: NDArray[np.float64],
+    gamma: float,
+    v: NDArray[np.float64],
+    q: NDArray[np.float64],
+) -> float:
+    """Updates row s of ``q`` and returns its greatest value."""
+    best = -np.inf
+    for a in range(q.shape[1]):
+        total = mean_rewards[s, a]
+        for e in range(first[s, a], first[s, a] + count[s, a]):
+            total += gamma * weights[e] * v[next_nodes[e]]
+        q[s, a] = total
+        best = max(best, total)
+    return best
+
+
+@compiled
+def _set_frontier(
+    groups: NDArray[np.int64],
+    expanded: NDArray[np.bool_],
+    active: NDArray[np.bool_],
+    means: NDArray[np.float64],
+    moved: NDArray[np.float64],
+    v: NDArray[np.float64],
+    frontier: NDArray[np.float64],
+) -> None:
+    """Gives the unexpanded states of every active group the mean value of its expanded ones; updates the last three."""
+    for g in range(len(frontier)):
+        if active[g]:
+            moved[g] = max(moved[g], abs(means[g] - frontier[g]))
+            frontier[g] = means[g]
+    for s in range(len(v)):
+        if active[groups[s]] and not expanded[s]:
+            v[s] = frontier[groups[s]]
+
+
+@compiled
+def _sweep(
     groups: NDArray[np.int64],
     expanded: NDArray[np.bool_],
     first: NDArray[np.int64],
@@ -113,7 +156,7 @@ def _sweep(  # noqa: C901 - one kernel: splitting it would hide the order of the
     frontier: NDArray[np.float64],
 ) -> None:
     """Sweeps over the ``active`` groups (overwritten); updates the last three arguments (see Values)."""
-    n, n_actions = first.shape
+    n = len(first)
     n_groups = len(frontier)
     sums, sizes = np.zeros(n_groups), np.zeros(n_groups)
     # Every group stops by its own measure: its values must not depend on what else is solved in the same call.
@@ -128,26 +171,12 @@ def _sweep(  # noqa: C901 - one kernel: splitting it would hide the order of the
             g = groups[s]
             if not (active[g] and expanded[s]):
                 continue
-            best = -np.inf
-            for a in range(n_actions):
-                total = mean_rewards[s, a]
-                for e in range(first[s, a], first[s, a] + count[s, a]):
-                    total += gamma * weights[e] * v[next_nodes[e]]
-                q[s, a] = total
-                best = max(best, total)
+            best = _bellman(s, first, count, next_nodes, weights, mean_rewards, gamma, v, q)
             moved[g] = max(moved[g], abs(best - v[s]))
             v[s] = best
             sums[g] += best
-        for g in range(n_groups):
-            if active[g]:
-                mean = sums[g] / max(sizes[g], 1.0)
-                moved[g] = max(moved[g], abs(mean - frontier[g]))
-                frontier[g] = mean
-        for s in range(n):
-            if active[groups[s]] and not expanded[s]:
-                v[s] = frontier[groups[s]]
-        for g in range(n_groups):
-            active[g] = active[g] and moved[g] > tolerance * scale[g]
+        _set_frontier(groups, expanded, active, sums / np.maximum(sizes, 1.0), moved, v, frontier)
+        active &= moved > tolerance * scale
         if not active.any():
             break
 
