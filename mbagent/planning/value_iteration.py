@@ -47,8 +47,9 @@ def score_edges(graph: StateGraph, goal: Goal, start: int = 0) -> Floats:
 def solve(graph: StateGraph, goal: Goal, gamma: float, n_groups: int = 1) -> Values:
     """Value iteration from scratch.
 
-    States that were never expanded are worth the mean of their group's expanded states, found together with the
-    values: zero would make every cost end, and every income stop, at the edge of what was imagined.
+    States that were never expanded are worth the lowest of their group's expanded states, found together with the
+    values. Zero would make every cost end, and every income stop, at the edge of what was imagined; the mean would
+    make that edge more attractive than a prize whose sequel is badly imagined, and the agent walk about for ever.
 
     Args:
         graph: what was imagined.
@@ -123,16 +124,16 @@ def _set_frontier(
     groups: NDArray[np.int64],
     expanded: NDArray[np.bool_],
     active: NDArray[np.bool_],
-    means: NDArray[np.float64],
+    lows: NDArray[np.float64],
     moved: NDArray[np.float64],
     v: NDArray[np.float64],
     frontier: NDArray[np.float64],
 ) -> None:
-    """Gives the unexpanded states of every active group the mean value of its expanded ones; updates the last three."""
+    """Gives the unexpanded states of every active group the lowest value of its expanded ones; updates the last three."""
     for g in range(len(frontier)):
         if active[g]:
-            moved[g] = max(moved[g], abs(means[g] - frontier[g]))
-            frontier[g] = means[g]
+            moved[g] = max(moved[g], abs(lows[g] - frontier[g]))
+            frontier[g] = lows[g]
     for s in range(len(v)):
         if active[groups[s]] and not expanded[s]:
             v[s] = frontier[groups[s]]
@@ -158,15 +159,14 @@ def _sweep(
     """Sweeps over the ``active`` groups (overwritten); updates the last three arguments (see Values)."""
     n = len(first)
     n_groups = len(frontier)
-    sums, sizes = np.zeros(n_groups), np.zeros(n_groups)
+    lows = np.full(n_groups, np.inf)
     # Every group stops by its own measure: its values must not depend on what else is solved in the same call.
     moved, scale = np.zeros(n_groups), np.full(n_groups, 1e-12)
     for s in range(n):
-        sizes[groups[s]] += expanded[s]
         scale[groups[s]] = max(scale[groups[s]], np.abs(mean_rewards[s]).max())
     for _ in range(max_sweeps):
         moved[:] = 0.0
-        sums[:] = 0.0
+        lows[:] = np.inf
         for s in range(n - 1, -1, -1):
             g = groups[s]
             if not (active[g] and expanded[s]):
@@ -174,8 +174,8 @@ def _sweep(
             best = _bellman(s, first, count, next_nodes, weights, mean_rewards, gamma, v, q)
             moved[g] = max(moved[g], abs(best - v[s]))
             v[s] = best
-            sums[g] += best
-        _set_frontier(groups, expanded, active, sums / np.maximum(sizes, 1.0), moved, v, frontier)
+            lows[g] = min(lows[g], best)
+        _set_frontier(groups, expanded, active, lows, moved, v, frontier)
         active &= moved > tolerance * scale
         if not active.any():
             break
