@@ -14,7 +14,7 @@ from torch.nn import functional
 from mbagent.models.base import Actions, Floats, States, hash_rows
 from mbagent.models.networks import Affine, FactorCodec
 from mbagent.models.planes import Convolution, cells_of
-from mbagent.models.threads import one_thread
+from mbagent.models.training import one_thread
 from mbagent.spaces import PlaneLayout
 from mbagent.transitions import TransitionBatch
 

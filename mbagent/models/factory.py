@@ -17,8 +17,8 @@ ModelFactory = Callable[[FactoredSpace, int, float], TransitionModel]
 """``factory(space, n_actions, learning_rate) -> model``."""
 
 PLANE_TRAINING = TrainingConfig(batch_size=128, weight_decay=1e-3, epochs=40.0, min_steps=1500, max_steps=4000)
-"""Shared weights see every position in every row: small batches do. Planning finds and exploits every wrong corner of a
-model, so the last tenths of a per cent matter: 4,000 steps leave a tenth of the errors that 2,500 leave."""
+"""Shared weights see every position in every row, so small batches do; but planning finds and exploits every wrong corner
+of a model, so training goes on for long."""
 
 
 def build_auto(space: FactoredSpace, n_actions: int, learning_rate: float) -> TransitionModel:
