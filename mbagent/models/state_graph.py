@@ -7,6 +7,8 @@ depend on which other observations are planned for in the same batch.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,20 @@ from mbagent.models.base import Bools, Floats, States, Successors, TransitionMod
 from mbagent_envs.random_keys import derive
 
 Indices = NDArray[np.int64]
+
+
+class GraphArrays(NamedTuple):
+    """What compiled kernels need of a graph; shapes and meanings as in StateGraph."""
+
+    groups: Indices
+    expanded: Bools
+    first: Indices
+    count: Indices
+    next_nodes: Indices
+    probabilities: Floats
+    terminated: Bools
+    sources: Indices
+    actions: Indices
 
 
 class StateGraph:
@@ -79,6 +95,11 @@ class StateGraph:
     terminated: Bools
     sources: Indices
     actions: Indices
+
+    @property
+    def arrays(self) -> GraphArrays:
+        """Views of what is filled so far."""
+        return GraphArrays(*(getattr(self, name) for name in GraphArrays._fields))
 
     def add(self, states: States, groups: Indices) -> Indices:
         """Nodes [B] of the given states [B, F] in the given groups [B]; new ones are appended in order of appearance."""

@@ -99,12 +99,7 @@ class _Search:
         graph, settings = self.graph, self.settings
         select(
             self.roots,
-            graph.expanded,
-            graph.first,
-            graph.count,
-            graph.next_nodes,
-            graph.probabilities,
-            graph.terminated,
+            graph.arrays,
             self.solution.q,
             self.visits,
             self.spans,
@@ -154,49 +149,24 @@ class _Search:
         return waiting[place_in_group(groups) < allowance[groups]]
 
     def _bellman(self, nodes: Ints) -> None:
-        graph = self.graph
-        initialise(
-            nodes,
-            graph.first,
-            graph.count,
-            graph.next_nodes,
-            graph.probabilities,
-            graph.terminated,
-            self.solution.rewards,
-            self.settings.gamma,
-            self.solution.v,
-            self.solution.q,
-        )
+        solution = self.solution
+        initialise(nodes, self.graph.arrays, solution.rewards, self.settings.gamma, solution.v, solution.q)
 
     def _back_up(self, paths: Paths, done: int) -> None:
-        graph, gamma = self.graph, self.settings.gamma
+        graph, gamma, solution = self.graph.arrays, self.settings.gamma, self.solution
         if self.settings.backup == "max":
-            back_up_max(
-                graph.sources,
-                graph.first,
-                graph.count,
-                graph.next_nodes,
-                graph.probabilities,
-                graph.terminated,
-                self.solution.rewards,
-                gamma,
-                paths.edges,
-                paths.lengths,
-                self.solution.v,
-                self.solution.q,
-            )
+            back_up_max(graph, solution.rewards, gamma, paths.edges, paths.lengths, solution.v, solution.q)
             return
         back_up_mean(
-            graph.sources,
-            graph.actions,
-            self.solution.rewards,
+            graph,
+            solution.rewards,
             gamma,
             self.prior,
             paths.edges,
             paths.lengths,
             self._end_values(paths, done),
             self.counted,
-            self.solution.q,
+            solution.q,
             self.spans,
             self.extremes,
         )

@@ -2,8 +2,8 @@
 
 The "tree" is a graph: a state reached in two ways is one node (a transposition). Every (node, action) keeps several
 sampled successors, as a stochastic world needs. Shapes: R roots, W simulations of a wave, H horizon, N nodes, A
-actions,
-M successor edges.
+actions, M
+successor edges.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.base import Bools, Floats
+from mbagent.models.base import Floats
+from mbagent.models.state_graph import GraphArrays
+from mbagent.planning.value_iteration import bellman
 from mbagent_envs._compiled import compiled
 from mbagent_envs.random_keys import uniform_at
 
@@ -62,12 +64,7 @@ def choose(node: int, q: Floats, visits: Floats, prior_visits: float, weight: fl
 @compiled
 def select(
     roots: Ints,
-    expanded: Bools,
-    first: Ints,
-    count: Ints,
-    next_nodes: Ints,
-    probabilities: Floats,
-    terminated: Bools,
+    graph: GraphArrays,
     q: Floats,
     visits: Floats,
     spans: Floats,
@@ -91,81 +88,48 @@ def select(
         for w in range(wave):
             node, length, leaf = roots[r], 0, -1
             while length < horizon:
-                if not expanded[node]:
+                if not graph.expanded[node]:
                     leaf = node
                     break
                 chosen = choose(node, q, visits, prior_visits, c_uct * spans[r])
                 visits[node, chosen] += 1.0
                 luck = uniform_at(key, (first_simulation + w) * horizon + length)
-                edge = first[node, chosen]
-                last = edge + count[node, chosen] - 1
-                while edge < last and luck >= probabilities[edge]:
-                    luck -= probabilities[edge]
+                edge = graph.first[node, chosen]
+                last = edge + graph.count[node, chosen] - 1
+                while edge < last and luck >= graph.probabilities[edge]:
+                    luck -= graph.probabilities[edge]
                     edge += 1
                 edges[r, w, length] = edge
                 length += 1
-                node = -1 if terminated[edge] else next_nodes[edge]
+                node = -1 if graph.terminated[edge] else graph.next_nodes[edge]
                 if node < 0:
                     break
-            if leaf < 0 and node >= 0 and not expanded[node]:
+            if leaf < 0 and node >= 0 and not graph.expanded[node]:
                 leaf = node
             lengths[r, w], leaves[r, w], ends[r, w] = length, leaf, node
 
 
 @compiled
-def initialise(
-    nodes: Ints,
-    first: Ints,
-    count: Ints,
-    next_nodes: Ints,
-    probabilities: Floats,
-    terminated: Bools,
-    rewards: Floats,
-    gamma: float,
-    v: Floats,
-    q: Floats,
-) -> None:
+def initialise(nodes: Ints, graph: GraphArrays, rewards: Floats, gamma: float, v: Floats, q: Floats) -> None:
     """Bellman backup of the given nodes [B] from the values ``v`` [N] of their successors, in place."""
     for node in nodes:
-        best = -np.inf
-        for a in range(q.shape[1]):
-            total = 0.0
-            for e in range(first[node, a], first[node, a] + count[node, a]):
-                future = 0.0 if terminated[e] else gamma * v[next_nodes[e]]
-                total += probabilities[e] * (rewards[e] + future)
-            q[node, a] = total
-            best = max(best, total)
-        v[node] = best
+        v[node] = bellman(node, graph, rewards, gamma, v, q)
 
 
 @compiled
-def back_up_max(
-    sources: Ints,
-    first: Ints,
-    count: Ints,
-    next_nodes: Ints,
-    probabilities: Floats,
-    terminated: Bools,
-    rewards: Floats,
-    gamma: float,
-    edges: Ints,
-    lengths: Ints,
-    v: Floats,
-    q: Floats,
-) -> None:
+def back_up_max(graph: GraphArrays, rewards: Floats, gamma: float, edges: Ints, lengths: Ints, v: Floats, q: Floats) -> None:
     """Bellman backups along every path, end first: trial-based heuristic tree search (Keller & Helmert 2013)."""
     n_roots, wave, _ = edges.shape
     for r in range(n_roots):
         for w in range(wave):
             for step in range(lengths[r, w] - 1, -1, -1):
-                node = sources[edges[r, w, step] : edges[r, w, step] + 1]
-                initialise(node, first, count, next_nodes, probabilities, terminated, rewards, gamma, v, q)
+                node = graph.sources[edges[r, w, step]]
+                v[node] = bellman(node, graph, rewards, gamma, v, q)
 
 
 @compiled
 def back_up_mean(
-    sources: Ints,
-    actions: Ints,
+    graph: GraphArrays,
     rewards: Floats,
     gamma: float,
     prior_visits: float,
@@ -179,7 +143,7 @@ def back_up_mean(
 ) -> None:
     """Running means of the simulated returns: plain UCT (Kocsis & Szepesvari 2006).
 
-    Args beyond those of ``back_up_max``: ``actions`` [M]; ``end_values`` [R, W], value of the node a simulation ended
+    Args beyond those of ``back_up_max``: ``end_values`` [R, W], value of the node a simulation ended
     at; ``counted`` [N, A], returns averaged so far; ``extremes`` [R, 2], lowest and highest return seen, from which
     ``spans`` [R] follow. All but the first arguments are updated in place.
     """
@@ -189,7 +153,7 @@ def back_up_mean(
             total = end_values[r, w]
             for step in range(lengths[r, w] - 1, -1, -1):
                 edge = edges[r, w, step]
-                node, a = sources[edge], actions[edge]
+                node, a = graph.sources[edge], graph.actions[edge]
                 total = rewards[edge] + gamma * total
                 counted[node, a] += 1.0
                 q[node, a] += (total - q[node, a]) / (prior_visits + counted[node, a])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mbagent.models.base import Bools, Floats, States, TransitionModel
 from mbagent.models.reachable import grow_reachable
-from mbagent.models.state_graph import StateGraph
+from mbagent.models.state_graph import GraphArrays, StateGraph
 from mbagent.planning.goal import Goal
 from mbagent_envs._compiled import compiled
 
@@ -75,107 +75,68 @@ def settle(graph: StateGraph, values: Values, gamma: float, max_sweeps: int = MA
         max_sweeps: sweeps, at most.
         only: bool [G], the groups to work on; None for all.
     """
-    flat = graph.sources * graph.model.n_actions + graph.actions
-    weights = values.rewards * graph.probabilities
-    mean_rewards: Floats = np.bincount(flat, weights=weights, minlength=values.q.size).astype(np.float64, copy=False)
-    _sweep(
-        graph.groups,
-        graph.expanded,
-        graph.first,
-        graph.count,
-        graph.next_nodes,
-        graph.probabilities * ~graph.terminated,
-        mean_rewards.reshape(values.q.shape),
-        gamma,
-        TOLERANCE,
-        max_sweeps,
-        np.ones(len(values.frontier), dtype=np.bool_) if only is None else only.copy(),
-        values.v,
-        values.q,
-        values.frontier,
-    )
+    active = np.ones(len(values.frontier), dtype=np.bool_) if only is None else only.copy()
+    _sweep(graph.arrays, values.rewards, gamma, TOLERANCE, max_sweeps, active, values.v, values.q, values.frontier)
 
 
 @compiled
-def _bellman(
-    s: int,
-    first: NDArray[np.int64],
-    count: NDArray[np.int64],
-    next_nodes: NDArray[np.int64],
-    weights: NDArray[np.float64],
-    mean_rewards: NDArray[np.float64],
-    gamma: float,
-    v: NDArray[np.float64],
-    q: NDArray[np.float64],
-) -> float:
-    """Updates row s of ``q`` and returns its greatest value."""
+def bellman(node: int, graph: GraphArrays, rewards: Floats, gamma: float, v: Floats, q: Floats) -> float:
+    """Sets row ``node`` of ``q`` [N, A] from the values ``v`` [N] of its successors, and returns its greatest value."""
     best = -np.inf
     for a in range(q.shape[1]):
-        total = mean_rewards[s, a]
-        for e in range(first[s, a], first[s, a] + count[s, a]):
-            total += gamma * weights[e] * v[next_nodes[e]]
-        q[s, a] = total
+        total = 0.0
+        for e in range(graph.first[node, a], graph.first[node, a] + graph.count[node, a]):
+            future = 0.0 if graph.terminated[e] else gamma * v[graph.next_nodes[e]]
+            total += graph.probabilities[e] * (rewards[e] + future)
+        q[node, a] = total
         best = max(best, total)
     return best
 
 
 @compiled
-def _set_frontier(
-    groups: NDArray[np.int64],
-    expanded: NDArray[np.bool_],
-    active: NDArray[np.bool_],
-    lows: NDArray[np.float64],
-    moved: NDArray[np.float64],
-    v: NDArray[np.float64],
-    frontier: NDArray[np.float64],
-) -> None:
+def _set_frontier(graph: GraphArrays, active: Bools, lows: Floats, moved: Floats, v: Floats, frontier: Floats) -> None:
     """Gives the unexpanded states of every active group the lowest value of its expanded ones; updates the last three."""
     for g in range(len(frontier)):
         if active[g]:
             moved[g] = max(moved[g], abs(lows[g] - frontier[g]))
             frontier[g] = lows[g]
     for s in range(len(v)):
-        if active[groups[s]] and not expanded[s]:
-            v[s] = frontier[groups[s]]
+        if active[graph.groups[s]] and not graph.expanded[s]:
+            v[s] = frontier[graph.groups[s]]
 
 
 @compiled
 def _sweep(
-    groups: NDArray[np.int64],
-    expanded: NDArray[np.bool_],
-    first: NDArray[np.int64],
-    count: NDArray[np.int64],
-    next_nodes: NDArray[np.int64],
-    weights: NDArray[np.float64],
-    mean_rewards: NDArray[np.float64],
+    graph: GraphArrays,
+    rewards: Floats,
     gamma: float,
     tolerance: float,
     max_sweeps: int,
-    active: NDArray[np.bool_],
-    v: NDArray[np.float64],
-    q: NDArray[np.float64],
-    frontier: NDArray[np.float64],
+    active: Bools,
+    v: Floats,
+    q: Floats,
+    frontier: Floats,
 ) -> None:
     """Sweeps over the ``active`` groups (overwritten); updates the last three arguments (see Values)."""
-    n = len(first)
     n_groups = len(frontier)
     lows = np.full(n_groups, np.inf)
     # Every group stops by its own measure: its values must not depend on what else is solved in the same call.
     moved, scale = np.zeros(n_groups), np.full(n_groups, 1e-12)
-    for s in range(n):
-        scale[groups[s]] = max(scale[groups[s]], np.abs(mean_rewards[s]).max())
+    for e in range(len(rewards)):
+        g = graph.groups[graph.sources[e]]
+        scale[g] = max(scale[g], abs(rewards[e]))
     for _ in range(max_sweeps):
         moved[:] = 0.0
         lows[:] = np.inf
-        for s in range(n - 1, -1, -1):
-            g = groups[s]
-            if not (active[g] and expanded[s]):
+        for s in range(len(v) - 1, -1, -1):
+            g = graph.groups[s]
+            if not (active[g] and graph.expanded[s]):
                 continue
-            best = _bellman(s, first, count, next_nodes, weights, mean_rewards, gamma, v, q)
+            best = bellman(s, graph, rewards, gamma, v, q)
             moved[g] = max(moved[g], abs(best - v[s]))
             v[s] = best
             lows[g] = min(lows[g], best)
-        _set_frontier(groups, expanded, active, lows, moved, v, frontier)
+        _set_frontier(graph, active, lows, moved, v, frontier)
         active &= moved > tolerance * scale
         if not active.any():
             break
