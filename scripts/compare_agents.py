@@ -22,7 +22,7 @@ import tyro
 from rich.console import Console
 
 from mbagent.analysis.cases import CASES, find_case
-from mbagent.analysis.comparison import FULL, QUICK, Settings, load, run
+from mbagent.analysis.comparison import BASELINES, FULL, QUICK, Settings, load, run
 from mbagent.analysis.report import write_report
 from mbagent.analysis.runner import JobsFailedError
 from mbagent.analysis.summary import save_csv, summarise
@@ -46,19 +46,36 @@ class Args:
     """Independent trainings of each agent; by default 2, with --full 5."""
     episodes: int | None = None
     """Episodes after each training, more where there are few states; by default 10, with --full 20."""
+    goal_seeds: int | None = None
+    """Trainings on which new goals and the learned reward are tried; by default 1, with --full 5."""
+    goal_episodes: int | None = None
+    """Episodes for each new goal; by default 4, with --full 20."""
+    baselines: tuple[str, ...] = BASELINES
+    """Which agents to compare with; none after a bare --baselines."""
+    baseline_multiples: tuple[int, ...] | None = None
+    """Baselines train for these multiples of the steps; by default 1, with --full 1 and 10."""
+    curves: bool = True
+    """Whether the agent is also trained for fewer steps, for its learning curve."""
     resume: bool = False
     """Go on with an interrupted run of the same settings instead of starting anew."""
     report_only: bool = False
     """Only write the report anew, from the records of the last run with the same settings."""
 
 
+_OVERRIDES = ("steps", "seeds", "episodes", "goal_seeds", "goal_episodes", "baselines", "baseline_multiples")
+
+
 def settings_of(args: Args) -> Settings:
     """The comparison's settings that the options stand for."""
     chosen = FULL if args.full else QUICK
-    given: dict[str, Any] = {"steps": args.steps, "seeds": args.seeds, "episodes": args.episodes}
+    given: dict[str, Any] = {name: getattr(args, name) for name in _OVERRIDES}
     chosen = replace(chosen, **{name: value for name, value in given.items() if value is not None})
+    unknown = [name for name in args.baselines if name not in BASELINES]
+    if unknown:
+        raise ValueError(f"There is no baseline {unknown[0]!r}; choose from {', '.join(BASELINES)}.")
     cases = tuple(find_case(key).key for key in args.cases)
-    return replace(chosen, cases=cases, curve_steps=tuple(s for s in chosen.curve_steps if s < chosen.steps))
+    curve_steps = tuple(s for s in chosen.curve_steps if s < chosen.steps and args.curves)
+    return replace(chosen, cases=cases, curve_steps=curve_steps)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -40,6 +40,7 @@ class Settings:
         curve_seeds: trainings for each of these points.
         goal_seeds: trainings on which new goals and the learned reward are tried.
         scale_episodes: episodes from which random play and references are measured.
+        baselines: the agents to compare with.
         cases: keys of the cases.
     """
 
@@ -52,6 +53,7 @@ class Settings:
     curve_seeds: int = 1
     goal_seeds: int = 1
     scale_episodes: int = 500
+    baselines: tuple[str, ...] = BASELINES
     cases: tuple[str, ...] = tuple(case.key for case in CASES)
 
 
@@ -90,7 +92,9 @@ def _jobs_of_seed(settings: Settings, case: Case, seed: int, steps: int) -> list
     if case.reward_given:
         jobs.append(replace(planned, agent=TRUE_MODEL, steps=0, learn_reward=False))
     jobs += [
-        Job(name, case.key, seed, steps * multiple, episodes) for name in BASELINES for multiple in settings.baseline_multiples
+        Job(name, case.key, seed, steps * multiple, episodes)
+        for name in settings.baselines
+        for multiple in settings.baseline_multiples
     ]
     if seed < settings.curve_seeds:
         jobs += [

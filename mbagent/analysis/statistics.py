@@ -20,7 +20,7 @@ class Interval:
     """An estimate with its confidence interval.
 
     Attributes:
-        estimate: the interquartile mean.
+        estimate: what is estimated.
         low: lower end of the interval.
         high: upper end of the interval.
     """
@@ -95,9 +95,45 @@ def interquartile_interval(scores: ArrayLike, *, confidence: float = 0.95, resam
         raise ValueError(f"The confidence is a probability between 0 and 1, not {confidence}.")
     runs, episodes = matrix.shape
     rng = np.random.default_rng(seed)
-    drawn_runs = rng.integers(runs, size=(resamples, runs, 1))
-    drawn_episodes = rng.integers(episodes, size=(resamples, runs, episodes))
-    replicates = interquartile_mean(matrix[drawn_runs, drawn_episodes].mean(axis=2))
+    drawn = _resample(runs, episodes, resamples, rng)
+    replicates = interquartile_mean(matrix[drawn].mean(axis=2))
     tail = (1 - confidence) / 2
     low, high = np.quantile(replicates, [tail, 1 - tail])
     return Interval(float(interquartile_mean(matrix.mean(axis=1))), float(low), float(high))
+
+
+def ratio_interval(
+    scores: ArrayLike, others: ArrayLike, zero: float, *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0
+) -> Interval:
+    """(mean of scores - zero) / (mean of others - zero), with a percentile bootstrap interval stratified by run.
+
+    Both were played with the same luck, entry by entry, so both are resampled together. Plain means on both sides: a
+    ratio would flatter an agent whose bad runs alone were cut off.
+
+    Args:
+        scores: floats [runs, episodes].
+        others: floats [runs, episodes], what they are measured against.
+        zero: what counts as nothing, such as random play's mean.
+        confidence: probability mass of the interval, between 0 and 1.
+        resamples: number of bootstrap resamples.
+        seed: seed of the resampling.
+
+    Raises:
+        ValueError: the two differ in shape, or ``others`` are not above ``zero``.
+    """
+    above, below = (np.asarray(x, dtype=np.float64) - zero for x in (scores, others))
+    if above.ndim != 2 or above.shape != below.shape or above.size == 0:
+        raise ValueError(f"Both sides need the same shape [runs, episodes], not {above.shape} and {below.shape}.")
+    if not below.mean() > 0:
+        raise ValueError(f"What is measured against ({below.mean() + zero:g}) has to be above zero's stand-in ({zero:g}).")
+    drawn = _resample(len(above), above.shape[1], resamples, np.random.default_rng(seed))
+    tops, bottoms = above[drawn].mean(axis=(1, 2)), below[drawn].mean(axis=(1, 2))
+    tail = (1 - confidence) / 2
+    low, high = np.quantile(tops / np.maximum(bottoms, 1e-12), [tail, 1 - tail])
+    return Interval(float(above.mean() / below.mean()), float(low), float(high))
+
+
+def _resample(runs: int, episodes: int, resamples: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], ...]:
+    """Index arrays that draw runs with replacement and, inside every run drawn, episodes with replacement."""
+    drawn_runs = rng.integers(runs, size=(resamples, runs, 1))
+    return drawn_runs, rng.integers(episodes, size=(resamples, runs, episodes))

@@ -13,7 +13,7 @@ from mbagent.analysis.cases import Case, Scale, find_case
 from mbagent.analysis.comparison import BASELINES, Settings
 from mbagent.analysis.jobs import all_goals
 from mbagent.analysis.records import AGENT, LEARNED_REWARD, RANDOM, REFERENCE, TRUE_MODEL, Record, write_csv
-from mbagent.analysis.statistics import Interval, interquartile_interval, normalised
+from mbagent.analysis.statistics import Interval, interquartile_interval, normalised, ratio_interval
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def _curves(records: Sequence[Record], scale: Scale) -> list[tuple[str, list[tup
 def _goal_rows(case: Case, records: Sequence[Record]) -> list[GoalRow]:
     rows = []
     for goal in all_goals(case)[1:]:
-        learned, true_model = ([r for r in records if r.agent == name and r.goal == goal] for name in (AGENT, TRUE_MODEL))
+        learned, true_model = (_final_all(records, name, goal) for name in (AGENT, TRUE_MODEL))
         if not learned or not true_model:
             continue
         scale = _measured(records, goal)
@@ -181,7 +181,7 @@ def _goal_rows(case: Case, records: Sequence[Record]) -> list[GoalRow]:
                 learned=float(np.mean([r.mean for r in learned])),
                 true_model=top,
                 reference=scale.reference,
-                ratio=_ratio([r.returns for r in learned], scale.random, top),
+                ratio=_ratio(learned, true_model, scale.random),
                 weights_unchanged=all(r.weights_before == r.weights_after == hashes[r.seed] for r in learned),
                 weights=learned[0].weights_after,
                 seeds=len(learned),
@@ -191,16 +191,19 @@ def _goal_rows(case: Case, records: Sequence[Record]) -> list[GoalRow]:
     return rows
 
 
-def _ratio(returns: Sequence[Sequence[float]], random: float, top: float) -> Interval:
-    """(learned - random) / (true model - random); the interval holds the learned agent's spread only."""
-    if not top > random:
+def _ratio(learned: Sequence[Record], true_model: Sequence[Record], random: float) -> Interval:
+    """(learned - random) / (true model - random), over the seeds that both have; the luck of an episode is the same for both."""
+    against = {r.seed: r.returns for r in true_model}
+    pairs = [(r.returns, against[r.seed]) for r in learned if r.seed in against]
+    if not pairs or not np.mean([theirs for _, theirs in pairs]) > random:
         return Interval(math.nan, math.nan, math.nan)
-    return interquartile_interval(normalised(returns, random, top))
+    ours, theirs = zip(*pairs, strict=True)
+    return ratio_interval(ours, theirs, random)
 
 
-def _final_all(records: Sequence[Record], agent: str) -> list[Record]:
-    """The records of one agent on the default goal, without points of learning curves."""
-    return [r for group in _final(records, agent).values() for r in group]
+def _final_all(records: Sequence[Record], agent: str, goal: str = "default") -> list[Record]:
+    """The records of one agent on one goal, without points of learning curves."""
+    return [r for group in _final(records, agent, goal).values() for r in group]
 
 
 def save_csv(path: Path, records: Sequence[Record], results: Sequence[CaseResult]) -> None:

@@ -67,7 +67,7 @@ def reachable_mdp(
     """The machine reachable from ``start`` int64 [B, F], as plain arrays; see ``grow_reachable`` for the arguments."""
     graph, complete = grow_reachable(model, start, max_states, n_samples, seed)
     order = np.lexsort((graph.actions, graph.sources))
-    counts = graph.count
+    counts = graph.counts
     ends = np.cumsum(counts.ravel()).reshape(counts.shape)
     starts = ends[:, :1] - counts[:, :1]
     return ReachableMDP(

@@ -24,7 +24,7 @@ class GraphArrays(NamedTuple):
     groups: Indices
     expanded: Bools
     first: Indices
-    count: Indices
+    counts: Indices
     next_nodes: Indices
     probabilities: Floats
     terminated: Bools
@@ -43,7 +43,7 @@ class StateGraph:
 
     Attributes (arrays are views of what is filled so far):
         states: int64 [N, F]. groups: int64 [N]. expanded: bool [N].
-        first, count: int64 [N, A].
+        first, counts: int64 [N, A].
         next_nodes: int64 [M]. probabilities: float64 [M]. terminated: bool [M].
         sources: int64 [M], the node each successor comes from. actions: int64 [M].
     """
@@ -58,7 +58,7 @@ class StateGraph:
             groups=np.zeros(0, dtype=np.int64),
             expanded=np.zeros(0, dtype=np.bool_),
             first=np.zeros((0, n_actions), dtype=np.int64),
-            count=np.zeros((0, n_actions), dtype=np.int64),
+            counts=np.zeros((0, n_actions), dtype=np.int64),
         )
         self._edges = _Table(
             next_nodes=np.zeros(0, dtype=np.int64),
@@ -89,7 +89,7 @@ class StateGraph:
     groups: Indices
     expanded: Bools
     first: Indices
-    count: Indices
+    counts: Indices
     next_nodes: Indices
     probabilities: Floats
     terminated: Bools
@@ -157,7 +157,7 @@ class StateGraph:
         )
         shape = (len(nodes), self.model.n_actions)
         self.first[nodes] = start + found.offsets[:-1].reshape(shape)
-        self.count[nodes] = np.diff(found.offsets).reshape(shape)
+        self.counts[nodes] = np.diff(found.offsets).reshape(shape)
         self.expanded[nodes] = True
         return np.arange(size, len(self), dtype=np.int64)
 

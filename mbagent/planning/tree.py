@@ -95,7 +95,7 @@ def select(
                 visits[node, chosen] += 1.0
                 luck = uniform_at(key, (first_simulation + w) * horizon + length)
                 edge = graph.first[node, chosen]
-                last = edge + graph.count[node, chosen] - 1
+                last = edge + graph.counts[node, chosen] - 1
                 while edge < last and luck >= graph.probabilities[edge]:
                     luck -= graph.probabilities[edge]
                     edge += 1

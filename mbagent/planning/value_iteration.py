@@ -85,7 +85,7 @@ def bellman(node: int, graph: GraphArrays, rewards: Floats, gamma: float, v: Flo
     best = -np.inf
     for a in range(q.shape[1]):
         total = 0.0
-        for e in range(graph.first[node, a], graph.first[node, a] + graph.count[node, a]):
+        for e in range(graph.first[node, a], graph.first[node, a] + graph.counts[node, a]):
             future = 0.0 if graph.terminated[e] else gamma * v[graph.next_nodes[e]]
             total += graph.probabilities[e] * (rewards[e] + future)
         q[node, a] = total

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mbagent.analysis.statistics import interquartile_interval, interquartile_mean, normalised
+from mbagent.analysis.statistics import interquartile_interval, interquartile_mean, normalised, ratio_interval
 
 
 def test_random_play_is_zero_and_the_reference_is_one() -> None:
@@ -59,3 +59,17 @@ def test_shapes_other_than_runs_by_episodes_are_refused() -> None:
             interquartile_interval(wrong)
     with pytest.raises(ValueError, match="between 0 and 1"):
         interquartile_interval([[1.0]], confidence=95)
+
+
+def test_a_ratio_compares_plain_means_and_resamples_both_sides_together() -> None:
+    others = np.random.default_rng(2).normal(10.0, 3.0, size=(5, 20))
+    half = ratio_interval(1.0 + (others - 1.0) / 2.0, others, zero=1.0)
+    assert half.estimate == pytest.approx(0.5)
+    assert half.high - half.low < 1e-12  # the episodes' luck is shared, so it leaves no width
+    bad_run = others.copy()
+    bad_run[0] = 1.0
+    assert ratio_interval(bad_run, others, zero=1.0).estimate == pytest.approx((bad_run - 1).sum() / (others - 1).sum())
+    with pytest.raises(ValueError, match="same shape"):
+        ratio_interval(others, others[:3], zero=1.0)
+    with pytest.raises(ValueError, match="above zero"):
+        ratio_interval(others, others, zero=50.0)
