@@ -1,4 +1,4 @@
-"""A machine of its own for each root: what can happen soon, imagined wide near the root and thin further on."""
+"""A machine of its own for each root: what is likely to happen soon, imagined wide near the root and thin further on."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from mbagent_envs.random_keys import derive
 LAYER_WIDTH = 32
 """Draws for a (state, action) are chosen so that a layer's states times draws stay about this many."""
 
+ABOUT_AS_LIKELY = 0.5
+"""States at least this share as likely as the likeliest are expanded together."""
+
 
 def layer_seed(seed: int, depth: int) -> int:
     """Random numbers of one depth: shared by all states and actions there, so that imagined luck is the same for all."""
@@ -18,36 +21,70 @@ def layer_seed(seed: int, depth: int) -> int:
 
 
 def grow_lookahead(graph: StateGraph, roots: NDArray[np.int64], max_states: int, n_samples: int, horizon: int, seed: int) -> None:
-    """Expands the graph breadth-first around every root, each in its own group, until a budget a root is used up.
+    """Expands the graph around every root, each in its own group, until a budget a root is used up.
 
-    The draws for each (state, action) shrink from ``n_samples`` near the root to one further on, so that the budget
-    reaches deep: with shared random numbers, states that differ only in what the agent did merge again.
+    The likeliest states go first: what the agent's own moves surely lead to is known before luck is followed, so that
+    one event with many outcomes near the root (a new maze, say) does not use up the budget and leave the sure part of
+    the world a blank. Among equally likely states the nearest go first. The draws for each (state, action) shrink from
+    ``n_samples`` near the root to one further on, so that the budget reaches deep: with shared random numbers, states
+    that differ only in what the agent did merge again.
 
     Args:
         graph: holds the roots, root g in group g, and nothing else.
         roots: int64 [R], their nodes.
         max_states: states expanded for each root, at most (the root itself always is).
         n_samples: draws near the root.
-        horizon: layers, at most.
+        horizon: steps from the root, at most.
         seed: which random numbers.
     """
     budget = np.full(len(roots), max_states, dtype=np.int64)
-    layer = roots
-    for depth in range(horizon):
-        groups = graph.groups[layer]
-        sizes = np.bincount(groups, minlength=len(roots))
-        place = place_in_group(groups)
-        keep = place < budget[groups]
-        layer, groups = layer[keep], groups[keep]
-        if len(layer) == 0:
+    reach, depth = np.zeros(len(graph)), np.zeros(len(graph), dtype=np.int64)
+    reach[roots] = 1.0
+    while True:
+        chosen = _likeliest(graph, reach, depth, budget, horizon)
+        if len(chosen) == 0:
             return
-        budget -= np.bincount(groups, minlength=len(roots))
-        draws = _draws(sizes, n_samples)[groups]
-        before = len(graph)
-        for n in np.unique(draws):
-            graph.expand(layer[draws == n], int(n), layer_seed(seed, depth))
-        fresh = np.arange(before, len(graph), dtype=np.int64)
-        layer = fresh[~graph.only_terminal(fresh)]
+        budget -= np.bincount(graph.groups[chosen], minlength=len(roots))
+        start = graph.n_edges
+        for level in np.unique(depth[chosen]):
+            layer = chosen[depth[chosen] == level]
+            sizes = np.bincount(graph.groups[layer], minlength=len(roots))
+            draws = _draws(sizes, n_samples)[graph.groups[layer]]
+            for n in np.unique(draws):
+                graph.expand(layer[draws == n], int(n), layer_seed(seed, int(level)))
+        reach, depth = _follow(graph, start, reach, depth)
+
+
+def _likeliest(
+    graph: StateGraph, reach: NDArray[np.float64], depth: NDArray[np.int64], budget: NDArray[np.int64], horizon: int
+) -> NDArray[np.int64]:
+    """The nodes to expand next: of each group those about as likely as its likeliest, nearest first, within the budget."""
+    waiting = np.flatnonzero(~graph.expanded & (reach > 0.0) & (depth < horizon))
+    groups = graph.groups[waiting]
+    top = np.zeros(len(budget))
+    np.maximum.at(top, groups, reach[waiting])
+    likely = reach[waiting] >= ABOUT_AS_LIKELY * top[groups]
+    nodes = waiting[likely]
+    nodes = nodes[np.lexsort((nodes, depth[nodes], -reach[nodes]))]
+    groups = graph.groups[nodes]
+    return nodes[place_in_group(groups) < budget[groups]]
+
+
+def _follow(
+    graph: StateGraph, start: int, reach: NDArray[np.float64], depth: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Reach and depth of all nodes after edges from number ``start`` on were added.
+
+    A node's reach is the probability of its likeliest path from the root, the agent's own choices counting as sure.
+    """
+    alive = ~graph.terminated[start:]
+    sources, targets = graph.sources[start:][alive], graph.next_nodes[start:][alive]
+    fresh = len(graph) - len(reach)
+    reach = np.concatenate([reach, np.zeros(fresh)])
+    depth = np.concatenate([depth, np.full(fresh, np.iinfo(np.int64).max)])
+    np.maximum.at(reach, targets, reach[sources] * graph.probabilities[start:][alive])
+    np.minimum.at(depth, targets, depth[sources] + 1)
+    return reach, depth
 
 
 def _draws(sizes: NDArray[np.int64], n_samples: int) -> NDArray[np.int64]:

@@ -9,7 +9,7 @@ from mbagent.models.state_graph import StateGraph
 from mbagent.planning.goal import Goal
 from mbagent.planning.lookahead import grow_lookahead
 from mbagent.planning.planner import Plan, PlannerSettings, best_actions
-from mbagent.planning.value_iteration import Machine, Values, solve
+from mbagent.planning.value_iteration import Machine, Values, break_ties, solve
 
 
 class MachinePlanner:
@@ -58,9 +58,9 @@ class MachinePlanner:
         self, graph: StateGraph, solution: Values, nodes: np.ndarray, shared: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(values, visits, scores) [R, A] of the root nodes [R]; here the values as they are, without a search."""
-        del graph, shared
+        del shared
         values = solution.q[nodes]
-        return values, np.zeros_like(values), values
+        return values, np.zeros_like(values), break_ties(graph, solution.q, nodes, self.settings.gamma)
 
     def _lookahead(self, roots: States) -> tuple[StateGraph, Values, np.ndarray]:
         """A machine around each root [R, F], solved; root r is in group r. Returns (graph, values, root nodes)."""

@@ -11,7 +11,7 @@ from mbagent.planning.machine_planner import MachinePlanner
 from mbagent.planning.planner import Plan, best_actions
 from mbagent.planning.rollouts import random_returns
 from mbagent.planning.tree import Ints, Paths, back_up_max, back_up_mean, empty_paths, initialise, select
-from mbagent.planning.value_iteration import Values, score_edges, settle
+from mbagent.planning.value_iteration import Values, break_ties, score_edges, settle
 from mbagent_envs.random_keys import derive
 
 FINAL_SWEEPS = 100
@@ -84,10 +84,11 @@ class _Search:
             if not self.rollouts:
                 self.spans = _spans(self.graph, self.solution, self.roots)
             done += wave
-        if self.settings.backup == "max":
-            settle(self.graph, self.solution, self.settings.gamma, FINAL_SWEEPS)
-        values, visits = self.solution.q[self.roots], self.root_visits
-        return values, visits, (visits + 1e-6 * _unit(values) if self.settings.backup == "mean" else values)
+        values, visits = self.solution.q, self.root_visits
+        if settings.backup == "mean":
+            return values[self.roots], visits, visits + 1e-6 * _unit(values[self.roots])
+        settle(self.graph, self.solution, settings.gamma, FINAL_SWEEPS)
+        return values[self.roots], visits, break_ties(self.graph, values, self.roots, settings.gamma)
 
     def _count(self, paths: Paths) -> None:
         """First actions of the wave's simulations; a root met again further down does not count."""

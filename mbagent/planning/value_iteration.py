@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mbagent.models.base import Bools, Floats, States, TransitionModel
 from mbagent.models.reachable import grow_reachable
-from mbagent.models.state_graph import GraphArrays, StateGraph
+from mbagent.models.state_graph import GraphArrays, Indices, StateGraph
 from mbagent.planning.goal import Goal
 from mbagent_envs._compiled import compiled
 
@@ -17,6 +17,11 @@ TOLERANCE = 1e-7
 """Sweeps stop when no value moves by more than this share of the largest reward."""
 
 MAX_SWEEPS = 5000
+
+TIE = 1e-6
+"""Values closer than this share of the greatest of them are equal: sweeps stop about there."""
+
+MAX_NEWS_SWEEPS = 200
 
 
 @dataclass
@@ -138,6 +143,60 @@ def _sweep(
             lows[g] = min(lows[g], best)
         _set_frontier(graph, active, lows, moved, v, frontier)
         active &= moved > tolerance * scale
+        if not active.any():
+            break
+
+
+def break_ties(graph: StateGraph, q: Floats, roots: Indices, gamma: float) -> Floats:
+    """Scores [R, A] of the roots' actions: their values, but of equally good ones that which leads somewhere new is ahead.
+
+    Where nothing in sight makes a difference, the best chance is what lies beyond: among behaviours that lose nothing,
+    the one that soonest leads to states not expanded yet. Without this an agent that sees no prize repeats its first
+    action for ever.
+
+    Args:
+        graph: what was imagined.
+        q: float64 [N, A], values of its actions.
+        roots: int64 [R], nodes to score.
+        gamma: discount, here of the steps until something new.
+    """
+    scores = q[roots].copy()
+    top = scores.max(axis=1, keepdims=True)
+    slack = TIE * np.maximum(np.abs(scores).max(axis=1, keepdims=True), 1e-12)
+    tied = scores >= top - slack
+    if (tied.sum(axis=1) < 2).all() or graph.expanded[graph.next_nodes[~graph.terminated]].all():
+        return scores
+    news = np.zeros_like(q)
+    _lead_to_news(graph.arrays, q, TIE, gamma, MAX_NEWS_SWEEPS, news)
+    found = news[roots]
+    scores[tied] = (top + slack * (1.0 + found))[tied]
+    return scores
+
+
+@compiled
+def _lead_to_news(graph: GraphArrays, q: Floats, tie: float, gamma: float, max_sweeps: int, news: Floats) -> None:
+    """Fills ``news`` [N, A]: discounted probability of an unexpanded state, by behaviour that is best under ``q``."""
+    w = np.where(graph.expanded, 0.0, 1.0)
+    active = np.ones(graph.groups.max() + 1, dtype=np.bool_)
+    for _ in range(max_sweeps):
+        moved = np.zeros(len(active))
+        for s in range(len(q) - 1, -1, -1):
+            g = graph.groups[s]
+            if not (active[g] and graph.expanded[s]):
+                continue
+            bar = q[s].max() - tie * max(np.abs(q[s]).max(), 1e-12)
+            best = 0.0
+            for a in range(q.shape[1]):
+                total = 0.0
+                for e in range(graph.first[s, a], graph.first[s, a] + graph.counts[s, a]):
+                    if not graph.terminated[e]:
+                        total += gamma * graph.probabilities[e] * w[graph.next_nodes[e]]
+                news[s, a] = total
+                if q[s, a] >= bar:
+                    best = max(best, total)
+            moved[g] = max(moved[g], abs(best - w[s]))
+            w[s] = best
+        active &= moved > TOLERANCE
         if not active.any():
             break
 

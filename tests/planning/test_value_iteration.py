@@ -4,6 +4,7 @@ import pytest
 from mbagent.models import SimulatorModel
 from mbagent.models.reachable import grow_reachable
 from mbagent.models.state_graph import StateGraph
+from mbagent.planning.lookahead import grow_lookahead
 from mbagent.planning.machine_planner import MachinePlanner
 from mbagent.planning.planner import PlannerSettings
 from mbagent.planning.value_iteration import solve
@@ -86,3 +87,55 @@ def test_the_machine_of_the_true_geyser_runner_is_exact() -> None:
         part = slice(mdp.offsets[state, action], mdp.offsets[state, action + 1])
         assert set(position[mdp.next_states[part]]) == {int(np.clip(position[state] + action - 1, 0, 9))}
         assert len(set(mdp.next_states[part])) == 5
+
+
+def many_corridors(n_corridors: int, length: int) -> tuple[TableWorld, np.ndarray]:
+    """Corridors with a prize at cell 0; from there a random cell of any corridor; in every other one the prize is missing."""
+    n = n_corridors * length
+    table, rewards = np.zeros((n, 2, n)), np.zeros(n)
+    for corridor, cell in np.ndindex(n_corridors, length):
+        s = corridor * length + cell
+        if corridor % 2 == 0 and cell == 0:
+            table[s] = 1.0 / n
+            rewards[s] = 1.0
+            continue
+        table[s, 0, corridor * length + max(cell - 1, 0)] = 1.0
+        table[s, 1, corridor * length + min(cell + 1, length - 1)] = 1.0
+    return TableWorld(table), rewards
+
+
+@pytest.mark.parametrize("start", [1, 2, 5, 8])
+def test_a_prize_that_opens_many_random_states_does_not_keep_the_agent_walking(start: int) -> None:
+    # The 600 states behind the prize are far more than the lookahead holds: spent on them, the corridor itself would
+    # stay half unknown, and its unknown end look better than the prize.
+    world, rewards = many_corridors(60, 10)
+    planner = MachinePlanner(PlannerSettings(max_states=1, lookahead_states=40))
+    planner.set_model(world, np.array([[start]]))
+    planner.set_goal(arrival_goal(rewards))
+    for cell in range(start, 0, -1):
+        assert planner.plan(np.array([[cell]])).actions[0] == 0
+
+
+def test_the_lookahead_knows_what_is_sure_before_it_follows_luck() -> None:
+    world, _ = many_corridors(60, 10)
+    graph = StateGraph(world)
+    roots = graph.add(np.array([[1]]), np.zeros(1, dtype=np.int64))
+    grow_lookahead(graph, roots, 30, 4, horizon=20, seed=0)
+    assert set(range(10)) <= set(graph.states[graph.expanded, 0])
+    assert graph.expanded.sum() == 30
+
+
+def test_where_nothing_matters_in_sight_the_agent_makes_for_what_it_has_not_imagined() -> None:
+    # A corridor closed on the left; the lookahead of 6 states ends before the prize at cell 30.
+    n = 40
+    table = np.zeros((n, 2, n))
+    for s in range(n):
+        table[s, 0, max(s - 1, 0)] = table[s, 1, min(s + 1, n - 1)] = 1.0
+    planner = MachinePlanner(PlannerSettings(max_states=1, lookahead_states=6))
+    planner.set_model(TableWorld(table), np.array([[0]]))
+    planner.set_goal(arrival_goal((np.arange(n) == 30).astype(np.float64)))
+    plan = planner.plan(np.array([[0], [1], [2]]))
+    assert np.ptp(plan.values) == 0.0  # ties are broken without touching the values
+    assert plan.actions.tolist() == [1, 1, 1]
+    planner.set_goal(arrival_goal((np.arange(n) == 0).astype(np.float64)))
+    assert planner.plan(np.array([[2]])).actions[0] == 0  # a prize comes first
