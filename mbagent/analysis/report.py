@@ -11,10 +11,11 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from gymnasium.error import DependencyNotInstalled
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from mbagent.analysis.baselines import SETTINGS
-from mbagent.analysis.cases import Case, game_of
+from mbagent.analysis.cases import Case
 from mbagent.analysis.comparison import Settings
 from mbagent.analysis.plots import colour_of, draw_curves, draw_game, draw_scores
 from mbagent.analysis.records import AGENT, LEARNED_REWARD
@@ -84,8 +85,11 @@ def _embedded(png: bytes) -> str:
 
 
 def _picture(case: Case) -> bytes | None:
-    """A picture of the case, where it is one of this package's games."""
-    return draw_game(case) if game_of(case) is not None else None
+    """A picture of the case; None where its drawing needs a package that is not installed."""
+    try:
+        return draw_game(case)
+    except DependencyNotInstalled:
+        return None
 
 
 def _words(options: Mapping[str, Any]) -> str:

@@ -179,7 +179,7 @@ class BaseTransitionModel(ABC):
             n_samples: draws for each row.
             seed: which random numbers.
         """
-        keys = derive(np.full(n_samples, seed, dtype=np.uint64), np.arange(n_samples))
+        keys = derive(seed, np.arange(n_samples))
         rows = np.repeat(np.arange(len(states)), n_samples)
         next_states, terminated = self.sample(states[rows], actions[rows], np.tile(keys, len(states)))
         return merge_draws(rows, len(states), next_states, terminated, np.full(len(rows), 1.0 / n_samples))
@@ -211,7 +211,7 @@ class BaseTransitionModel(ABC):
             (mean [B, ...], variance [B, ...]), the unbiased sample moments.
         """
         rows = np.repeat(np.arange(len(states)), n_samples)
-        keys = derive(np.full(len(rows), seed, dtype=np.uint64), np.arange(len(rows)))
+        keys = derive(seed, np.arange(len(rows)))
         next_states, _ = self.sample(states[rows], actions[rows], keys)
         values = np.asarray(of(next_states) if of else next_states, dtype=np.float64)
         values = values.reshape(len(states), n_samples, *values.shape[1:])

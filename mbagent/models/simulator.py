@@ -48,7 +48,7 @@ class SimulatorModel(BaseTransitionModel):
 
     def start_states(self, n: int, seed: int = 0) -> States:
         """Start states int64 [n, F] of the game: an agent with this model can plan without having learned."""
-        return self._factors(self.game.initial(derive(np.full(n, seed, dtype=np.uint64), np.arange(n))))
+        return self._factors(self.game.initial(derive(seed, np.arange(n))))
 
     def _observations(self, states: States) -> NDArray[np.int8]:
         return np.ascontiguousarray(states, dtype=np.int8).reshape(len(states), *self._shape)

@@ -45,7 +45,7 @@ class FlatMonteCarlo:
         rows = np.repeat(np.arange(len(roots)), n_actions * each)
         actions = np.tile(np.repeat(np.arange(n_actions), each), len(roots))
         # Simulation k meets the same luck under every action.
-        luck = derive(np.full(each, settings.seed, dtype=np.uint64), np.arange(each))
+        luck = derive(settings.seed, np.arange(each))
         keys = np.tile(luck, len(roots) * n_actions)
         returns = random_returns(model, goal, roots[rows], keys, settings.horizon, settings.gamma, actions)
         returns = returns.reshape(shape)

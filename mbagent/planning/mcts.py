@@ -181,7 +181,7 @@ class _Search:
             return values
         settings = self.settings
         simulation = np.broadcast_to(done + np.arange(paths.ends.shape[1]), paths.ends.shape)[alive]
-        keys = derive(np.full(len(simulation), settings.seed, dtype=np.uint64), _SEARCH_SALT, simulation)
+        keys = derive(settings.seed, _SEARCH_SALT, simulation)
         states = self.graph.states[paths.ends[alive]]
         model, goal = self.planner._known_model(), self.planner._known_goal()
         values[alive] = random_returns(model, goal, states, keys, settings.horizon, settings.gamma)

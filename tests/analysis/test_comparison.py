@@ -80,7 +80,7 @@ def test_a_whole_comparison_becomes_one_page_and_one_table(tmp_path: Path) -> No
 
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "http" not in page  # nothing is fetched
-    assert page.count("data:image/png;base64,") == 3  # bars, curves, one game
+    assert page.count("data:image/png;base64,") == 4  # bars, curves, two environments
     table = (tmp_path / "results.csv").read_text(encoding="utf-8").splitlines()
     assert table[0].startswith("case,agent,goal,seed,environment_steps")
     assert len({line.count(",") for line in table}) == 2  # the one agent with a comma in its name is quoted
