@@ -11,6 +11,9 @@ import os
 
 # Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Pictures are drawn without a window or sound, so that machines without a screen have nothing to complain about.
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
 
 import sys
 import time

@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback,
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import mbagent
 from mbagent import ModelLearningAgent
@@ -124,6 +124,14 @@ def test_reward_and_termination_are_learned_where_they_are_not_given() -> None:
     assert [int(agent.predict(np.array(s))[0]) for s in range(4)] == [1, 1, 1, 1]
     plan = agent.policy.plan(np.array([[3]]))
     assert plan.values[0, 1] == pytest.approx(1.0, abs=0.02)  # nothing is earned after termination
+
+
+def test_rewards_are_learned_as_the_environment_gave_them_whatever_a_wrapper_makes_of_them() -> None:
+    env = VecNormalize(DummyVecEnv([Corridor]), norm_obs=False, norm_reward=True)
+    with pytest.warns(UserWarning, match="no reward_fn"):
+        agent = ModelLearningAgent("MctsPolicy", env, seed=0).learn(2000, log_interval=None)
+    assert set(np.unique(agent.transitions.rows().rewards)) == {0.0, 1.0}
+    assert int(agent.predict(np.array(3))[0]) == 1
 
 
 def test_learning_goes_on_where_it_stopped() -> None:
