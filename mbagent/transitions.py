@@ -119,10 +119,10 @@ class TransitionDataset:
             min_episodes: as said above.
 
         Returns:
-            (training, validation); with fewer than 10 rows both are all rows.
+            (training, validation); with a fraction of 0, or fewer than 10 rows, both are all rows.
         """
         rows = self.rows()
-        if len(rows) < 10:
+        if fraction == 0.0 or len(rows) < 10:
             return rows, rows
         _, groups = np.unique(rows.episodes, return_inverse=True)
         if groups.max() + 1 < min_episodes:

@@ -14,6 +14,7 @@ from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
 from mbagent.analysis.cases import Case, game_of
+from mbagent.analysis.pages import FIGURE_STYLE, to_png
 from mbagent.analysis.records import AGENT, LEARNED_REWARD, RANDOM, TRUE_MODEL
 from mbagent.analysis.summary import CaseResult
 from mbagent_envs.references import reference_policy
@@ -29,38 +30,17 @@ COLOURS = {
 }
 """One colour for each agent, in every picture."""
 
-_STYLE: Any = {
-    "font.size": 9.5,
-    "font.family": "DejaVu Sans",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": "#b8bfc8",
-    "axes.labelcolor": "#4a5361",
-    "axes.titlesize": 10.5,
-    "axes.titleweight": "bold",
-    "xtick.color": "#4a5361",
-    "ytick.color": "#4a5361",
-    "svg.hashsalt": "mbagent",
-}
-
 
 def colour_of(agent: str) -> str:
     """The colour of an agent, whatever follows its name after a comma."""
     return COLOURS.get(agent) or next((colour for name, colour in COLOURS.items() if agent.startswith(name + ",")), "#555555")
 
 
-def to_png(figure: Figure) -> bytes:
-    """A figure as the bytes of a PNG file."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=140, bbox_inches="tight", facecolor="white")
-    return buffer.getvalue()
-
-
 def draw_scores(results: Sequence[CaseResult]) -> bytes:
     """Bars of the normalised return of every agent on every case, with their 95% intervals."""
     agents = [name for name in COLOURS if any(row.agent == name for result in results for row in result.rows)]
     agents = [name for name in agents if name != RANDOM]  # zero by definition
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(max(6.5, 1.9 * len(results)), 3.6))
         axes = figure.subplots()
         width = 0.84 / max(len(agents), 1)
@@ -96,7 +76,7 @@ def draw_curves(results: Sequence[CaseResult]) -> bytes:
     """Normalised return against environment steps for each case; bands reach from worst to best seed."""
     columns = min(3, max(len(results), 1))
     rows = -(-len(results) // columns)
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(3.6 * columns, 2.7 * rows), layout="constrained")
         grid = figure.subplots(rows, columns, squeeze=False)
         for axes in grid.flat[len(results) :]:

@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-import base64
-import math
-import platform
 from collections.abc import Mapping, Sequence
-from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from gymnasium.error import DependencyNotInstalled
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from mbagent.analysis.baselines import SETTINGS
 from mbagent.analysis.cases import Case
 from mbagent.analysis.comparison import Settings
+from mbagent.analysis.pages import render
 from mbagent.analysis.plots import colour_of, draw_curves, draw_game, draw_scores
 from mbagent.analysis.records import AGENT, LEARNED_REWARD
 from mbagent.analysis.statistics import Interval
 from mbagent.analysis.summary import CaseResult
-
-_SHOWN_VERSIONS = ("gymnasium", "stable-baselines3", "torch", "numpy", "numba")
 
 
 def write_report(path: Path, results: Sequence[CaseResult], settings: Settings, *, command: str, minutes: float) -> None:
@@ -35,15 +28,9 @@ def write_report(path: Path, results: Sequence[CaseResult], settings: Settings, 
         command: the command line that makes this page again.
         minutes: wall time of the whole comparison.
     """
-    environment = Environment(
-        loader=PackageLoader("mbagent.analysis", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(number=format_number, interval=format_interval, embedded=_embedded, colour=colour_of)
-    page = environment.get_template("report.html.jinja").render(
+    page = render(
+        "report.html.jinja",
+        {"colour": colour_of},
         results=results,
         settings=settings,
         command=command,
@@ -53,35 +40,10 @@ def write_report(path: Path, results: Sequence[CaseResult], settings: Settings, 
         pictures={result.case.key: _picture(result.case) for result in results},
         headline=_headline(results),
         baseline_settings={name: _words(options) for name, options in SETTINGS.items()},
-        versions={name: metadata.version(name) for name in _SHOWN_VERSIONS},
-        python=platform.python_version(),
-        date=datetime.now(tz=UTC).strftime("%Y-%m-%d"),
         agents={"agent": AGENT, "learned_reward": LEARNED_REWARD},
         arguments={result.case.key: _words(result.case.kwargs) for result in results},
     )
     path.write_text(page, encoding="utf-8")
-
-
-def format_number(value: float, digits: int = 2) -> str:
-    """A number for a table: a true minus sign, an en dash for what was not measured."""
-    if math.isnan(value):
-        return "–"
-    text = f"{value:,.{digits}f}"
-    if float(text.replace(",", "")) == 0:
-        text = text.lstrip("-")
-    return text.replace("-", "−")
-
-
-def format_interval(interval: Interval, digits: int = 2) -> str:
-    """The ends of an interval for a table."""
-    if math.isnan(interval.low):
-        return ""
-    return f"{format_number(interval.low, digits)} … {format_number(interval.high, digits)}"
-
-
-def _embedded(png: bytes) -> str:
-    """A picture as a data address, so that the page needs no other file."""
-    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
 
 
 def _picture(case: Case) -> bytes | None:

@@ -13,6 +13,7 @@ from rich.console import Console
 from mbagent.analysis.cases import find_case
 from mbagent.analysis.comparison import FULL, QUICK, Settings, load, plan_jobs, run
 from mbagent.analysis.jobs import Job, RewardOnly, run_job
+from mbagent.analysis.pages import format_interval, format_number
 from mbagent.analysis.records import (
     AGENT,
     LEARNED_REWARD,
@@ -23,7 +24,7 @@ from mbagent.analysis.records import (
     read_records,
     write_records,
 )
-from mbagent.analysis.report import format_interval, format_number, write_report
+from mbagent.analysis.report import write_report
 from mbagent.analysis.runner import JobsFailedError, run_jobs
 from mbagent.analysis.statistics import Interval
 from mbagent.analysis.summary import save_csv, summarise

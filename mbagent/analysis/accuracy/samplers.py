@@ -1,0 +1,185 @@
+"""The samplers compared, each a transition model fitted to a trial's observations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, TypeVar
+
+import numpy as np
+
+from mbagent.analysis.accuracy.data import Observations
+from mbagent.analysis.accuracy.measures import Distribution, counted, number
+from mbagent.models.base import TransitionModel
+from mbagent.models.boltzmann import BoltzmannConfig, ConditionalBoltzmannMachine
+from mbagent.models.config import NeuralConfig
+from mbagent.models.neural import NeuralTransitionModel
+from mbagent.models.tabular import TabularModel
+from mbagent.models.training import TrainingConfig
+from mbagent_envs.random_keys import derive
+
+T = TypeVar("T")
+
+PREDICTOR = "predictor alone (paper)"
+COMBINED = "predictor + conditioner (paper)"
+CAUSAL = "causal conditioner"
+BOLTZMANN = "conditional Boltzmann machine"
+TABLE = "counts with a prior"
+PERFECT = "perfect sampler"
+
+EXHAUSTIVE = 12
+"""Up to so many variables all 2^d outcomes are listed."""
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How the paper's networks are fitted, where its text leaves a choice.
+
+    Attributes:
+        iterations: passes over the data, "reshuffling the data on each iteration".
+        targets: "batch": P(y | X), the frequencies, as in 3.1's first method; "online": every observation's own y,
+            one update each, its second, "slower and sensitive to the order of training".
+        loss: "squared", as in backpropagation's textbook form, or "cross_entropy".
+        learning_rate: largest rate of the batch method's schedule.
+        batch_size: distinct observations of an update, batch targets.
+        sweeps: passes over all variables for one sample; the paper says "repeat".
+        real_guess: start from the predictor's probabilities, as step 2 reads, rather than from bits drawn from them.
+        rounding: "2d^2+1" hidden nodes in d groups: "down" is 2d a group, "up" 2d + 1.
+    """
+
+    iterations: int = 250
+    targets: Literal["batch", "online"] = "batch"
+    loss: Literal["squared", "cross_entropy"] = "cross_entropy"
+    learning_rate: float = 0.03
+    batch_size: int = 16
+    sweeps: int = 5
+    real_guess: bool = False
+    rounding: Literal["down", "up"] = "down"
+
+
+def paper_config(d: int, options: FitOptions) -> NeuralConfig:
+    """The paper's two networks for d variables."""
+    config = NeuralConfig.paper(d)
+    training = replace(
+        config.training,
+        loss=options.loss,
+        learning_rate=options.learning_rate,
+        batch_size=options.batch_size,
+        epochs=float(options.iterations),
+        min_steps=1,
+        max_steps=10**9,
+        validation=0.0,
+        patience=10**9,
+    )
+    size = config.group_size + (options.rounding == "up")
+    return replace(config, group_size=size, sweeps=options.sweeps, real_guess=options.real_guess, training=training)
+
+
+def causal_config(d: int) -> NeuralConfig:
+    """The agent's conditioner, grown and trained until it knows the observations by heart: here nothing generalises."""
+    training = TrainingConfig(
+        learning_rate=0.01,
+        weight_decay=0.0,
+        batch_size=64,
+        epochs=400.0,
+        min_steps=4000,
+        max_steps=20_000,
+        validation=0.0,
+        patience=10**9,
+    )
+    return NeuralConfig(hidden=(8 * d + 32,), group_size=4 * d + 32, dropout=0.0, certain=1.0, training=training)
+
+
+def fit_paper(data: Observations, options: FitOptions, seed: int) -> tuple[NeuralTransitionModel, NeuralTransitionModel]:
+    """(predictor alone, predictor and conditioner combined); the predictor is the same."""
+    config = paper_config(data.d, options)
+    cards = (2,) * data.d
+    combined = NeuralTransitionModel(cards, 1, config, seed=seed)
+    if options.targets == "batch":
+        combined.fit(data.dataset(), seed=seed)
+    else:
+        _fit_online(combined, data, options.iterations, seed)
+    alone = NeuralTransitionModel(cards, 1, replace(config, conditioner=None), seed=seed)
+    state = combined.state_dict()
+    alone.load_state_dict({name: value for name, value in state.items() if name.startswith("predictor.")})
+    return alone, combined
+
+
+def _fit_online(model: NeuralTransitionModel, data: Observations, iterations: int, seed: int) -> None:
+    rows, rng = data.dataset().rows(), np.random.default_rng(seed)
+    for _ in range(iterations):
+        for i in rng.permutation(len(rows)):
+            row = rows.select(slice(i, i + 1))  # type: ignore[arg-type]  # any index will do
+            model.observe(row.states, row.actions, row.next_states, row.terminated)
+
+
+def fit_causal(data: Observations, seed: int) -> NeuralTransitionModel:
+    """Predictor and causal conditioner with exact probabilities."""
+    model = NeuralTransitionModel((2,) * data.d, 1, causal_config(data.d), seed=seed)
+    model.fit(data.dataset(), seed=seed)
+    return model
+
+
+def fit_boltzmann(data: Observations, seed: int) -> ConditionalBoltzmannMachine:
+    """The other family that the paper's discussion names."""
+    model = ConditionalBoltzmannMachine((2,) * data.d, 1, BoltzmannConfig(hidden=16 * data.d))
+    model.fit(data.dataset(), seed=seed)
+    return model
+
+
+def fit_table(data: Observations, prior: float) -> TabularModel:
+    """Counts; without a prior they are the perfect sampler."""
+    model = TabularModel((2,) * data.d, 1, prior=prior, validation=0.0)
+    model.fit(data.dataset())
+    return model
+
+
+def observed(data: Observations) -> Distribution:
+    """The observed frequencies."""
+    n, c, _ = data.outputs.shape
+    return counted(np.repeat(np.arange(n), c), number(data.outputs).ravel(), np.ones(n * c), n)
+
+
+def draw(model: TransitionModel, data: Observations, n_draws: int, seed: int) -> Distribution:
+    """Frequencies of ``n_draws`` independent draws for each input."""
+    n = len(data.inputs)
+    found = np.empty((n, n_draws), dtype=np.uint64)
+    step = max(1, 200_000 // n_draws)
+    for begin in range(0, n, step):
+        rows = np.repeat(np.arange(begin, min(begin + step, n)), n_draws)
+        keys = derive(derive(seed, rows), np.tile(np.arange(n_draws), len(rows) // n_draws))
+        states, _ = model.sample(data.inputs[rows], np.zeros(len(rows), dtype=np.int64), keys)
+        found[begin : begin + step] = number(states).reshape(-1, n_draws)
+    return counted(np.repeat(np.arange(n), n_draws), found.ravel(), np.ones(n * n_draws), n)
+
+
+def draw_systematically(model: TransitionModel, data: Observations, n_draws: int, seed: int) -> Distribution:
+    """``n_draws`` systematic draws for each input: one grid with a shared offset, through the inverse distribution function."""
+    n = len(data.inputs)
+    successors = model.successors(data.inputs, np.zeros(n, dtype=np.int64), n_draws, seed)
+    return counted(successors.rows, number(successors.states), successors.probabilities, n)
+
+
+def exact(model: TransitionModel, data: Observations) -> Distribution:
+    """Exact probabilities: of all outcomes where those can be listed, else of the observed ones.
+
+    Raises:
+        NotImplementedError: the model has none.
+    """
+    n, d = len(data.inputs), data.d
+    if d <= EXHAUSTIVE:
+        every = (np.arange(2**d)[:, None] >> np.arange(d)) & 1
+        rows, outcomes = np.repeat(np.arange(n), 2**d), np.tile(every, (n, 1))
+    else:
+        seen = observed(data)
+        rows = seen.inputs
+        outcomes = ((seen.outcomes[:, None] >> np.arange(d, dtype=np.uint64)) & np.uint64(1)).astype(np.int64)
+    nothing = np.zeros(len(rows), dtype=np.int64)
+    logs = model.log_prob(data.inputs[rows], nothing, outcomes, nothing.astype(np.bool_))
+    return Distribution(rows, number(outcomes), np.exp(logs), n, complete=d <= EXHAUSTIVE)
+
+
+def log_likelihood(truth: Distribution, found: Distribution) -> float:
+    """Mean log-probability of an observation in nats, from exact probabilities."""
+    pairs = {(int(i), int(y)): float(q) for i, y, q in zip(found.inputs, found.outcomes, found.probabilities, strict=True)}
+    logs = [np.log(max(pairs.get((int(i), int(y)), 0.0), 1e-300)) for i, y in zip(truth.inputs, truth.outcomes, strict=True)]
+    return float((np.array(logs) * truth.probabilities).sum() / truth.n)

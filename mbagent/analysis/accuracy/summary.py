@@ -1,0 +1,187 @@
+"""From the scores of single data sets to the table, and to the paper's conclusions as checked statements (section 3.4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from mbagent.analysis.accuracy.experiment import FEW_ITERATIONS, Draws, Score
+from mbagent.analysis.accuracy.samplers import COMBINED, PREDICTOR
+from mbagent.analysis.accuracy.trials import TRIALS, Trial
+from mbagent.analysis.statistics import Interval
+
+MEASURES: dict[str, str] = {
+    "union": "Pearson, union",
+    "seen": "Pearson, observed",
+    "full": "Pearson, all outcomes",
+    "variation": "Total variation",
+    "valid": "Valid mass",
+    "log_likelihood": "Log-likelihood",
+}
+"""Columns of the table: field of a score and what it is called."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A measure over seeds.
+
+    Attributes:
+        interval: mean with its 95% t interval, over the seeds where it is defined; NaN where it never is.
+        undefined: seeds where it is not.
+    """
+
+    interval: Interval
+    undefined: int
+
+
+@dataclass(frozen=True)
+class Line:
+    """One sampler's line in a trial's table."""
+
+    sampler: str
+    draws: Draws
+    cells: dict[str, Cell]
+    parameters: int
+    fit_seconds: float
+    sample_microseconds: float
+    seeds: int
+
+
+@dataclass(frozen=True)
+class Statement:
+    """One of the paper's conclusions, checked.
+
+    Attributes:
+        text: the conclusion.
+        evidence: the figures it is judged by.
+        holds: whether they bear it out.
+    """
+
+    text: str
+    evidence: str
+    holds: bool
+
+
+def mean_interval(values: Iterable[float]) -> Cell:
+    """Mean and 95% t interval over seeds; NaN values are counted, not averaged."""
+    given = np.asarray(list(values), dtype=np.float64)
+    known = given[~np.isnan(given)]
+    if len(known) == 0:
+        return Cell(Interval(np.nan, np.nan, np.nan), len(given))
+    mean = float(known.mean())
+    half = 0.0
+    if len(known) > 1:
+        half = float(stats.t.ppf(0.975, len(known) - 1) * known.std(ddof=1) / np.sqrt(len(known)))
+    return Cell(Interval(mean, mean - half, mean + half), len(given) - len(known))
+
+
+def table(scores: Sequence[Score], trial: Trial) -> list[Line]:
+    """A trial's lines, in the order in which samplers were measured."""
+    mine = [score for score in scores if score.trial == trial.name]
+    lines = []
+    for sampler, draws in dict.fromkeys((score.sampler, score.draws) for score in mine):
+        group = [score for score in mine if (score.sampler, score.draws) == (sampler, draws)]
+        lines.append(
+            Line(
+                sampler,
+                draws,
+                {name: mean_interval(getattr(score, name) for score in group) for name in MEASURES},
+                group[0].parameters,
+                float(np.mean([score.fit_seconds for score in group])),
+                float(np.median([score.sample_microseconds for score in group])),
+                len(group),
+            )
+        )
+    return lines
+
+
+def paper_parameters(d: int) -> tuple[int, int]:
+    """Weights of predictor and conditioner by the paper's counts: 2d + 1 hidden nodes, 2d^2 + 1 less the pruned weights.
+
+    The predictor: d (2d + 1) + (2d + 1) d and thresholds. The conditioner: 2d nodes in each of d groups, each with d
+    inputs and d - 1 other outputs, a threshold and one weight to its output, and the outputs' thresholds.
+    """
+    predictor = d * (2 * d + 1) + (2 * d + 1) * d + (2 * d + 1) + d
+    conditioner = 2 * d * d * (d + d - 1 + 1 + 1) + d
+    return predictor, conditioner
+
+
+def statements(scores: Sequence[Score]) -> list[Statement]:
+    """The conclusions of section 3.4 that the trials at hand can judge."""
+    present = {score.trial for score in scores}
+    found = [_better_than_alone(scores)]
+    if {"1a", "1b"} <= present:
+        found.append(_milder_without_correlation(scores))
+    if {"2b", "3"} <= present:
+        found.append(_falls(scores, ("2b", "3"), "Performance deteriorates with the number of dimensions"))
+    if {"2a", "2b", "2c"} <= present:
+        found.append(_falls(scores, ("2a", "2b", "2c"), "Sparser data is easier to model"))
+    return [*found, *_zeros_and_ones(scores)]
+
+
+def _values(scores: Sequence[Score], trial: str, sampler: str, read: Callable[[Score], float]) -> np.ndarray:
+    """One value a seed, of the samplers' many draws."""
+    chosen = [s for s in scores if (s.trial, s.sampler, s.draws) == (trial, sampler, "many")]
+    return np.array([read(s) for s in sorted(chosen, key=lambda s: s.seed)], dtype=np.float64)
+
+
+def _union(score: Score) -> float:
+    return score.union
+
+
+def _gain(scores: Sequence[Score], trial: str) -> np.ndarray:
+    gain: np.ndarray = _values(scores, trial, COMBINED, _union) - _values(scores, trial, PREDICTOR, _union)
+    return gain
+
+
+def _better_than_alone(scores: Sequence[Score]) -> Statement:
+    gains = {trial.name: _gain(scores, trial.name) for trial in TRIALS if any(s.trial == trial.name for s in scores)}
+    cells = {name: mean_interval(gain).interval for name, gain in gains.items()}
+    text = "; ".join(f"{name} {c.estimate:+.3f} [{c.low:+.3f}, {c.high:+.3f}]" for name, c in cells.items())
+    holds = all(c.estimate > 0.0 for c in cells.values())
+    return Statement("The combined sampler is always superior to the predictor alone", f"gain in correlation: {text}", holds)
+
+
+def _milder_without_correlation(scores: Sequence[Score]) -> Statement:
+    low, high = float(np.nanmean(_gain(scores, "1a"))), float(np.nanmean(_gain(scores, "1b")))
+    text = f"gain {low:+.3f} in 1a (uncorrelated), {high:+.3f} in 1b (correlated)"
+    return Statement("Without correlation between variables the difference is milder", text, low < high)
+
+
+def _falls(scores: Sequence[Score], trials: tuple[str, ...], text: str) -> Statement:
+    means = [float(np.nanmean(_values(scores, trial, COMBINED, _union))) for trial in trials]
+    wrong = [float(np.nanmean(_values(scores, trial, COMBINED, lambda s: s.variation))) for trial in trials]
+    pairs = ", ".join(
+        f"{trial}: correlation {mean:.3f}, total variation {tv:.3f}" for trial, mean, tv in zip(trials, means, wrong, strict=True)
+    )
+    return Statement(text, pairs, means == sorted(means, reverse=True))
+
+
+def _zeros_and_ones(scores: Sequence[Score]) -> list[Statement]:
+    early = f"{COMBINED}, {FEW_ITERATIONS} iterations"
+    figures = {}
+    for name, field in (("zero", "at_zero"), ("one", "at_one")):
+        for sampler in (early, COMBINED):
+            chosen = [getattr(s, field) for s in scores if s.sampler == sampler and s.draws == "many"]
+            figures[name, sampler] = mean_interval(chosen).interval.estimate
+    zero, one = figures["zero", COMBINED], figures["one", COMBINED]
+    mass = {
+        sampler: mean_interval(1.0 - s.valid for s in scores if s.sampler == sampler and s.draws == "many").interval.estimate
+        for sampler in (early, COMBINED)
+    }
+    return [
+        Statement(
+            "Transitions with observed probability zero are overestimated, those with probability one underestimated",
+            f"mean estimate {zero:.4f} where zero was observed, {one:.3f} where one was",
+            zero > 0.0 and not one >= 1.0,
+        ),
+        Statement(
+            "More training pushes the estimates closer to the frequencies",
+            f"mass on outcomes never observed: {mass[early]:.3f} after {FEW_ITERATIONS} iterations, {mass[COMBINED]:.3f} at the "
+            f"end; estimate where one was observed: {figures['one', early]:.3f}, then {one:.3f}",
+            mass[COMBINED] < mass[early],
+        ),
+    ]

@@ -1,0 +1,97 @@
+"""Measures how accurately models sample transition probabilities (the paper's section 3.3), beside the paper's figures.
+
+python scripts/sampling_accuracy.py                         # quick: 3 data sets a trial, without the largest trial
+python scripts/sampling_accuracy.py --full                  # 20 data sets a trial, 5 of the largest
+python scripts/sampling_accuracy.py --trials 2a --fit.targets online
+
+"""
+
+from __future__ import annotations
+
+import os
+
+# Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from rich.console import Console
+
+from mbagent.analysis.accuracy.experiment import FIRST_SCORED_SEED, Outcome, Settings, collect, plan, run_task
+from mbagent.analysis.accuracy.page import save_csv, write_page
+from mbagent.analysis.accuracy.samplers import FitOptions
+from mbagent.analysis.accuracy.trials import TRIALS
+from mbagent.analysis.parallel import run_all
+
+QUICK_TRIALS = tuple(trial.name for trial in TRIALS if trial.options.d <= 8)
+
+
+@dataclass(frozen=True)
+class Args:
+    """Measure how accurately models sample transition probabilities."""
+
+    full: bool = False
+    """All trials with 20 data sets each, 5 of the largest (about two hours on two cores)."""
+    trials: tuple[str, ...] | None = None
+    """Which of 1a, 1b, 2a, 2b, 2c, 3; by default all but 3, with --full all."""
+    seeds: int | None = None
+    """Data sets for each trial; by default 3."""
+    first_seed: int = FIRST_SCORED_SEED
+    """Number of the first data set; those below 1000 are for choosing settings."""
+    n_draws: int = 1000
+    """Draws for each input."""
+    relates: Literal["previous", "input"] = "previous"
+    """What a variable copies: the output variable set before it, or the same variable of the input."""
+    shuffle: Literal["output", "input"] = "output"
+    """Whether the order of variables is drawn anew for every output or once for every input."""
+    multiplier: float = 1.0
+    """The paper's b: share of the d^2 inputs that is used."""
+    fit: FitOptions = field(default_factory=FitOptions)
+    """How the paper's networks are fitted."""
+    output: Path = Path("results/sampling_accuracy")
+    """Folder for the page and results.csv."""
+    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
+    """Number of processes, each with one thread."""
+
+
+def settings_of(args: Args) -> Settings:
+    """The settings that the options stand for."""
+    trials = args.trials if args.trials is not None else tuple(t.name for t in TRIALS) if args.full else QUICK_TRIALS
+    seeds = args.seeds if args.seeds is not None or args.full else 3
+    if seeds is not None and seeds < 1:
+        raise ValueError(f"--seeds must be at least 1 data set, got {seeds}.")
+    if args.n_draws < 1:
+        raise ValueError(f"--n-draws must be at least 1, got {args.n_draws}.")
+    return Settings(trials, seeds, args.first_seed, args.n_draws, args.fit, args.relates, args.shuffle, args.multiplier)
+
+
+def _line(outcome: Outcome) -> str:
+    return f"trial {outcome.task.trial}, data set {outcome.task.seed}"
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command line and returns its exit code."""
+    args = tyro.cli(Args, args=argv, description=__doc__)
+    console = Console()
+    try:
+        settings = settings_of(args)
+        tasks = plan(settings)
+    except ValueError as error:
+        console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
+        return 1
+    args.output.mkdir(parents=True, exist_ok=True)
+    outcomes = list(run_all(run_task, tasks, workers=args.workers, console=console, name=_line))
+    save_csv(args.output / "results.csv", collect(outcomes))
+    given = sys.argv[1:] if argv is None else argv
+    command = " ".join(["python scripts/sampling_accuracy.py", *given])
+    write_page(args.output / "report.html", outcomes, settings, command)
+    console.print(f"Wrote {args.output / 'report.html'} and {args.output / 'results.csv'}.")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
