@@ -13,6 +13,14 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
+from mbagent.arguments import (
+    check_exploration,
+    check_learning_rate,
+    check_log_interval,
+    check_model,
+    check_seed,
+    check_timesteps,
+)
 from mbagent.experience import ExperienceRecorder, distinct_rows
 from mbagent.exploration import EXPLORATIONS, Exploration
 from mbagent.goals import GoalBook
@@ -96,6 +104,9 @@ class ModelLearningAgent(SavableAlgorithm):
         _init_setup_model: bool = True,
     ) -> None:
         """See the class."""
+        if env is None and _init_setup_model:
+            raise ValueError("env must be an environment or a registered id, got None; load() is the way to one without.")
+        seed = check_seed(seed)
         super().__init__(
             policy,
             env,
@@ -110,8 +121,8 @@ class ModelLearningAgent(SavableAlgorithm):
         )
         if not issubclass(self.policy_class, PlannerPolicy):
             raise TypeError(f"policy must be a planner policy such as 'MctsPolicy', got {self.policy_class.__name__}.")
-        self.model_name: str | TransitionModel = model
-        self.exploration_name: str | Exploration = exploration
+        self.model_name = check_model(model)
+        self.exploration_name = check_exploration(exploration)
         self.gamma, self.num_simulations, self.horizon = gamma, num_simulations, horizon
         self.fit_report: FitReport | None = None
         self._custom_reward = reward
@@ -133,17 +144,12 @@ class ModelLearningAgent(SavableAlgorithm):
         return self.policy.transition_model
 
     def _settings(self) -> PlannerSettings:
-        try:
-            return PlannerSettings(
-                num_simulations=self.num_simulations,
-                gamma=self.gamma,
-                horizon=self.horizon,
-                seed=self._planning_seed,
-                **self.policy_kwargs,
-            )
-        except TypeError as error:
-            known = sorted(set(PlannerSettings.__dataclass_fields__) - {"num_simulations", "gamma", "horizon", "seed"})
-            raise TypeError(f"policy_kwargs takes {', '.join(known)}: {error}.") from error
+        own: dict[str, Any] = {"num_simulations": self.num_simulations, "gamma": self.gamma, "horizon": self.horizon}
+        known = sorted(set(PlannerSettings.__dataclass_fields__) - {*own, "seed"})
+        unknown = sorted(set(self.policy_kwargs) - set(known))
+        if unknown:
+            raise TypeError(f"policy_kwargs has no {unknown[0]!r}; it takes {', '.join(known)}.")
+        return PlannerSettings(**own, seed=self._planning_seed, **self.policy_kwargs)
 
     def _setup_model(self) -> None:
         self._setup_lr_schedule()
@@ -152,7 +158,7 @@ class ModelLearningAgent(SavableAlgorithm):
         space, actions = FactoredSpace(self.observation_space), ActionEnumeration(self.action_space)
         model = self.model_name
         if isinstance(model, str):
-            model = build_model(model, space, actions.n, self.lr_schedule(1.0))
+            model = build_model(model, space, actions.n, check_learning_rate(self.lr_schedule(1.0)))
         elif tuple(model.cardinalities) != space.cardinalities or model.n_actions != actions.n:
             raise ValueError(
                 f"The model has {len(model.cardinalities)} factors and {model.n_actions} actions, but the environment "
@@ -181,11 +187,8 @@ class ModelLearningAgent(SavableAlgorithm):
         self.set_reward(self._custom_reward) if self._custom_reward is not None else self._refresh()
 
     def _build_exploration(self, n_actions: int) -> Exploration:
-        if not isinstance(self.exploration_name, str):
-            return self.exploration_name
-        if self.exploration_name not in EXPLORATIONS:
-            raise ValueError(f"exploration must be one of {sorted(EXPLORATIONS)}, got {self.exploration_name!r}.")
-        return EXPLORATIONS[self.exploration_name](n_actions)
+        chosen = self.exploration_name
+        return EXPLORATIONS[chosen](n_actions) if isinstance(chosen, str) else chosen
 
     # ------------------------------------------------------------------ goals
 
@@ -220,10 +223,12 @@ class ModelLearningAgent(SavableAlgorithm):
     ) -> Self:
         """Explores for ``total_timesteps`` steps, then fits the model to everything met so far.
 
-        A run stopped by a callback still fits what it has. Called again, it goes on: transitions are kept.
+        A run stopped by a callback still fits what it has. Called again, it goes on: transitions are kept. The fit comes
+        at the end, so callbacks that evaluate or save on the way see the agent as it was before: for a learning curve,
+        call it several times with ``reset_num_timesteps=False``.
 
         Args:
-            total_timesteps: environment steps, over all copies of the environment.
+            total_timesteps: environment steps, over all copies of the environment; 0 only fits what was met before.
             callback: SB3 callbacks, called at every step.
             log_interval: iterations (of 1,000 steps) between two entries in the log; None for none.
             tb_log_name: name of the run in TensorBoard.
@@ -233,20 +238,23 @@ class ModelLearningAgent(SavableAlgorithm):
         if self.env is None:
             raise ValueError("learn() needs an environment; give one with set_env(env) or load(path, env=env).")
         fresh_start = reset_num_timesteps or self._last_obs is None or self._recorder is None
-        total, callbacks = self._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        steps, log_interval = check_timesteps(total_timesteps), check_log_interval(log_interval)
+        total, callbacks = self._setup_learn(steps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if fresh_start or self._recorder is None:
             self._recorder = ExperienceRecorder(self.policy.factored, self.transitions, self.n_envs)
             self._recorder.reset(self._last_obs)
         callbacks.on_training_start(locals(), globals())
         going, iteration = True, 0
-        while going and self.num_timesteps < total:
-            going = self._explore(min(total, self.num_timesteps + ITERATION_STEPS), callbacks, self._recorder)
-            iteration += 1
-            self._update_current_progress_remaining(self.num_timesteps, max(total, 1))
-            if log_interval is not None and iteration % log_interval == 0:
-                self._log_rollout()
-                self.logger.dump(self.num_timesteps)
-        self._recorder.flush()
+        try:
+            while going and self.num_timesteps < total:
+                going = self._explore(min(total, self.num_timesteps + ITERATION_STEPS), callbacks, self._recorder)
+                iteration += 1
+                self._update_current_progress_remaining(self.num_timesteps, max(total, 1))
+                if log_interval is not None and iteration % log_interval == 0:
+                    self._log_rollout()
+                    self.logger.dump(self.num_timesteps)
+        finally:  # an interrupted run keeps what it met: learn(0) fits to it
+            self._recorder.flush()
         if len(self.transitions):
             self._fit(self._recorder, progress_bar)
             if log_interval is not None:
@@ -294,7 +302,7 @@ class ModelLearningAgent(SavableAlgorithm):
         began = time.perf_counter()
         self._refresh()
         log_fit(self.logger, report, self._n_updates, len(self.transitions), len(self.policy.start_states))
-        if len(self.policy.start_states):
+        if len(self.policy.start_states) and self.policy.goal is not None:
             plan = self.policy.plan(self.policy.start_states[:1])
             self.logger.record("plan/start_value", float(plan.values.max()))
             self.logger.record("plan/first_seconds", time.perf_counter() - began)

@@ -67,6 +67,8 @@ class ExperienceRecorder:
                 ``TimeLimit.truncated``.
         """
         assert self.states is not None
+        if not np.isfinite(rewards).all():
+            raise ValueError("The environment returned a reward of NaN or infinity; mend the environment or wrap its rewards.")
         following = self._space.encode(new_obs)
         next_states = following
         ended = np.flatnonzero(dones)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from typing import Literal
 
+import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -16,6 +17,16 @@ from mbagent.transitions import TransitionDataset
 Source = Literal["custom", "environment", "learned", "missing"]
 
 _PROBE_ROWS = 64
+
+
+def reward_wrapper(env: VecEnv) -> str | None:
+    """Name of a wrapper of the first environment that changes rewards, or None (also where another process hides it)."""
+    inner = getattr(env.unwrapped, "envs", [None])[0]
+    while isinstance(inner, gym.Wrapper):
+        if isinstance(inner, gym.RewardWrapper | gym.wrappers.NormalizeReward):
+            return type(inner).__name__
+        inner = inner.env
+    return None
 
 
 class GoalBook:
@@ -41,6 +52,8 @@ class GoalBook:
         self._environment: GivenReward | None = None
         self._since = 0
         self._has_environment = False
+        self._changes_rewards: str | None = None
+        self._told: str | None = None
         self.source: Source = "environment"
         self.learned = False
 
@@ -52,6 +65,7 @@ class GoalBook:
         except Exception:  # a VecEnv in another process answers with whatever error pickling gives
             fn = None
         self._environment = self._given(fn) if callable(fn) else None
+        self._changes_rewards, self._told = reward_wrapper(env), None
 
     def forget_learned(self) -> None:
         """The learned reward is out of date: there are new transitions."""
@@ -80,12 +94,23 @@ class GoalBook:
         problem = self._environment_problem()
         if problem is None:
             self.source = "environment"
+            if self._changes_rewards and self._policy.fitted and len(self._transitions) == self._since:
+                self._tell(
+                    f"{self._changes_rewards} changes the environment's rewards, which the agent has not met yet: until the next "
+                    "learn() it plans with the reward_fn inside; to be sure, give the goal with set_reward(fn)."
+                )
             return self._environment
         self.source = "learned"
         if not self._policy.fitted:
             return None
-        warnings.warn(f"{problem}, so the agent plans with a reward learned from the rewards it met.", stacklevel=5)
+        self._tell(f"{problem}, so the agent plans with a reward learned from the rewards it met.")
         return self.learned_goal()
+
+    def _tell(self, message: str) -> None:
+        """Warns, unless the last warning said the same."""
+        if message != self._told:
+            warnings.warn(message, stacklevel=6)
+            self._told = message
 
     def restore(self, source: Source) -> Goal | None:
         """The goal of an agent loaded from a file, where only its source is kept; None if it must be given again."""

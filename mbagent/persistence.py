@@ -6,6 +6,7 @@ import io
 import json
 import os
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -113,9 +114,11 @@ def read(source: Target) -> tuple[dict[str, Any], dict[str, dict[str, NDArray[An
     """
     if isinstance(source, str | os.PathLike):
         path = Path(source)
-        source = path if path.exists() or path.suffix else path.with_suffix(".zip")
-        if not Path(source).exists():
+        source = path if path.is_file() or path.suffix else path.with_suffix(".zip")
+        if not Path(source).is_file():
             raise FileNotFoundError(f"There is no file {source}; save an agent there first.")
+    elif not hasattr(source, "read"):
+        raise TypeError(f"An agent is loaded from a path or an open binary file, got {source!r}.")
     try:
         with zipfile.ZipFile(source) as archive:
             names = archive.namelist()
@@ -124,7 +127,7 @@ def read(source: Target) -> tuple[dict[str, Any], dict[str, dict[str, NDArray[An
             if data.get("format") != FORMAT:
                 raise ValueError("This file was not saved by an mbagent agent; load it with the algorithm that saved it.")
             arrays = {Path(name).stem: _arrays(archive.read(name)) for name in names if name.endswith(".npz")}
-    except (zipfile.BadZipFile, json.JSONDecodeError, KeyError) as error:
+    except (zipfile.BadZipFile, json.JSONDecodeError, UnicodeDecodeError, KeyError, NotImplementedError, zlib.error) as error:
         raise ValueError(f"This file is no saved agent, or is damaged: {error}.") from error
     return data, arrays
 
@@ -145,5 +148,5 @@ def _arrays(raw: bytes) -> dict[str, NDArray[Any]]:
     try:
         with np.load(io.BytesIO(raw), allow_pickle=False) as group:
             return {name: group[name] for name in group.files}
-    except ValueError as error:
+    except (ValueError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
         raise ValueError(f"The file holds an array that needs pickle or is damaged: {error}.") from error

@@ -155,12 +155,31 @@ class PlannerPolicy(BasePolicy):
         unknown = [name for name in arrays if name.partition(".")[0] not in ("model", "reward")]
         if unknown:
             raise ValueError(f"There is no parameter called {unknown[0]!r}; take names from get_parameters()['policy'].")
+        for name, value in arrays.items():
+            if value.dtype.kind == "f" and not np.isfinite(value).all():
+                raise ValueError(f"The parameter {name!r} holds NaN or infinity; take weights from a sound agent.")
+        before, reward = self.transition_model.state_dict(), _part(arrays, "reward.")
         self.transition_model.load_state_dict(_part(arrays, "model."))
-        reward = _part(arrays, "reward.")
-        if reward:
-            self.reward_model.load_state_dict(reward)
+        try:
+            if reward:
+                self.reward_model.load_state_dict(reward)
+        except (ValueError, RuntimeError, KeyError) as error:
+            self.transition_model.load_state_dict(before)
+            reason = " ".join(str(error).split())
+            raise ValueError(
+                f"These weights do not fit this agent's learned reward, so none was taken over: {reason}."
+            ) from error
         self.fitted = True
         self.refresh()
+
+    def save(self, path: Any) -> None:
+        """Refused: a policy without its agent's settings cannot be loaded again."""
+        raise NotImplementedError("A planner policy is saved with its agent: agent.save(path), ModelLearningAgent.load(path).")
+
+    @classmethod
+    def load(cls, path: Any, device: Any = "auto") -> Any:
+        """Refused, see ``save``."""
+        raise NotImplementedError("A planner policy is loaded with its agent: ModelLearningAgent.load(path).policy.")
 
 
 class MctsPolicy(PlannerPolicy):
@@ -191,12 +210,12 @@ def as_batch(space: spaces.Space[Any], observation: Any) -> tuple[Any, bool]:
         if not isinstance(observation, Mapping) or set(observation) != set(space.spaces):
             raise ValueError(f"The observation must be a dict with the keys {sorted(space.spaces)}, got {observation!r}.")
         parts = {key: as_batch(part, observation[key]) for key, part in space.spaces.items()}
-        return {key: batch for key, (batch, _) in parts.items()}, all(single for _, single in parts.values())
+        return {key: batch for key, (batch, _) in parts.items()}, _all_single(list(parts.values()))
     if isinstance(space, spaces.Tuple):
         if not isinstance(observation, tuple | list) or len(observation) != len(space.spaces):
             raise ValueError(f"The observation must be a tuple of {len(space.spaces)} parts, got {observation!r}.")
         pairs = [as_batch(part, value) for part, value in zip(space.spaces, observation, strict=True)]
-        return tuple(batch for batch, _ in pairs), all(single for _, single in pairs)
+        return tuple(batch for batch, _ in pairs), _all_single(pairs)
     array, shape = np.asarray(observation), tuple(space.shape or ())
     if array.shape == shape:
         return array[None], True
@@ -206,6 +225,16 @@ def as_batch(space: spaces.Space[Any], observation: Any) -> tuple[Any, bool]:
         f"The observation has shape {array.shape}, but {space} needs {shape}, or (batch, {', '.join(map(str, shape))}) "
         "for a batch; pass observations as the environment returns them."
     )
+
+
+def _all_single(parts: list[tuple[Any, bool]]) -> bool:
+    """Whether all parts are single observations; ValueError if they are not all alike, or batches of unequal length."""
+    if len({single for _, single in parts}) > 1:
+        raise ValueError("Some parts of the observation are batches and some are not; give one observation or a batch of all.")
+    lengths = {len(batch) for batch, _ in parts if not isinstance(batch, dict | tuple)}
+    if len(lengths) > 1:
+        raise ValueError(f"The parts of the observation are batches of unequal length, {sorted(lengths)}; give each as many.")
+    return all(single for _, single in parts)
 
 
 def _part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:

@@ -5,6 +5,7 @@ A reward never steers exploration and never touches a transition model; it is ha
 
 from __future__ import annotations
 
+import inspect
 from typing import Any, Protocol
 
 import numpy as np
@@ -28,6 +29,17 @@ class RewardFn(Protocol):
         ...
 
 
+def _check_signature(fn: Any) -> None:
+    try:
+        signature = inspect.signature(fn)
+    except (TypeError, ValueError):  # compiled callables may have none
+        return
+    try:
+        signature.bind(None, None, None)
+    except TypeError as error:
+        raise TypeError(f"A reward function is called as fn(obs, action, next_obs), but {fn!r} takes {signature}.") from error
+
+
 class GivenReward:
     """A user's or an environment's reward function, as a goal on factors.
 
@@ -45,6 +57,7 @@ class GivenReward:
         """See the class."""
         if not callable(fn):
             raise TypeError(f"A reward must be a function of (obs, action, next_obs), got {fn!r}.")
+        _check_signature(fn)
         self.fn, self._space, self._actions = fn, space, actions
 
     def __call__(self, states: States, actions: Actions, next_states: States) -> Floats:
@@ -57,10 +70,17 @@ class GivenReward:
             self._space.decode_wide(next_states),
         )
         result = self.fn(*batch)
+        if result is None:
+            raise TypeError("The reward function returned None; it must return an array of numbers: is a return missing?")
         try:
-            rewards = np.asarray(result, dtype=np.float64)
+            found = np.asarray(result)
+            if found.dtype.kind not in "biuf":
+                raise TypeError(f"values of type {found.dtype}")
+            rewards = found.astype(np.float64)
         except (TypeError, ValueError) as error:
-            raise TypeError(f"The reward function must return an array of numbers, got {type(result).__name__}.") from error
+            raise TypeError(
+                f"The reward function must return an array of numbers, got {type(result).__name__} ({error})."
+            ) from error
         if rewards.shape != (len(actions),):
             raise ValueError(
                 f"The reward function must return one number for each of the {len(actions)} transitions it is given "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self, cast
+from typing import TYPE_CHECKING, Any, Self, cast, get_args
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 
 from mbagent import persistence
+from mbagent.goals import Source
 from mbagent.rewards import RewardFn
 from mbagent.transitions import TransitionBatch
 
@@ -31,6 +32,24 @@ SETTINGS = (
     "seed",
 )
 """Constructor arguments kept as they are; keyword arguments of ``load`` override them."""
+
+REQUIRED = (
+    "policy_class",
+    "observation_space",
+    "action_space",
+    "settings",
+    "learning_rate",
+    "model",
+    "exploration",
+    "planning_seed",
+    "reward_source",
+    "fitted",
+    "reward_learned",
+    "num_timesteps",
+    "n_envs",
+    "n_updates",
+)
+"""What a file's data must hold."""
 
 
 class SavableAlgorithm(BaseAlgorithm):
@@ -169,6 +188,7 @@ def _load(
     overrides: dict[str, Any],
 ) -> ModelLearningAgent:
     data, arrays = persistence.read(source)
+    _check(data, arrays)
     allowed = set(inspect.signature(cls.__init__).parameters) - {
         "self",
         "policy",
@@ -199,9 +219,30 @@ def _load(
     return agent
 
 
+def _check(data: dict[str, Any], arrays: dict[str, Any]) -> None:
+    """Raises ValueError, naming what is wrong, if the file lacks something."""
+    missing = [name for name in REQUIRED if name not in data] + [
+        f"{name}.npz" for name in ("policy", "planning") if name not in arrays
+    ]
+    if not missing and "start_states" not in arrays["planning"]:
+        missing = ["planning.npz: start_states"]
+    if missing:
+        raise ValueError(f"The file is no complete saved agent: it lacks {', '.join(missing)}.")
+    if not isinstance(data["settings"], dict) or data["reward_source"] not in get_args(Source):
+        raise ValueError("The file is damaged: its settings or its reward source cannot be read.")
+
+
 def _restore(agent: ModelLearningAgent, data: dict[str, Any], arrays: dict[str, Any], reward: RewardFn | None) -> None:
     policy = agent.policy
-    policy.start_states = arrays["planning"]["start_states"].astype(np.int64)
+    starts = arrays["planning"]["start_states"].astype(np.int64)
+    if (
+        starts.ndim != 2
+        or starts.shape[1] != len(policy.factored)
+        or (starts < 0).any()
+        or (starts >= policy.factored.cardinalities).any()
+    ):
+        raise ValueError("The file's start states lie outside its observation space; it is damaged.")
+    policy.start_states = starts
     if "transitions" in arrays:
         agent.transitions.append(TransitionBatch(**arrays["transitions"]))
     fitted = bool(data["fitted"])

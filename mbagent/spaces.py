@@ -88,6 +88,8 @@ class FactoredSpace:
         self.space = space
         self.kind = kind
         self._leaves = list(_leaves(space, (), kind))
+        if not any(leaf.cardinalities for leaf in self._leaves):
+            raise ValueError(f"The {kind} space {space} holds no variable; there is nothing to learn about.")
         self.cardinalities: tuple[int, ...] = tuple(c for leaf in self._leaves for c in leaf.cardinalities)
         self.names: tuple[str, ...] = tuple(_factor_names(self._leaves, kind))
         self.planes = _plane_layout(space)
@@ -117,7 +119,7 @@ class FactoredSpace:
                     f"The {self.kind} batch{_at(leaf)} has shape {values.shape}, but {leaf.space} needs "
                     f"(batch, {', '.join(map(str, leaf.shape))}); pass a batch of {self.kind}s of the environment's space."
                 )
-            flat = values.reshape(len(values), -1)
+            flat = values.reshape(len(values), len(leaf.cardinalities))
             if flat.dtype.kind not in "iub" and not np.array_equal(flat, np.floor(flat)):
                 raise ValueError(f"The {self.kind}{_at(leaf)} holds values that are not whole numbers; {leaf.space} has none.")
             factors = flat.astype(np.int64) - leaf.low
@@ -168,6 +170,11 @@ class ActionEnumeration:
 
     def __init__(self, space: spaces.Space[Any]) -> None:
         """See the class."""
+        if isinstance(space, spaces.Dict | spaces.Tuple):
+            raise TypeError(
+                f"The action space {space} is a {type(space).__name__}: Discrete, MultiDiscrete and MultiBinary are supported; "
+                "make it one MultiDiscrete in a gymnasium.ActionWrapper."
+            )
         self.factored = FactoredSpace(space, kind="action")
         self.n = int(np.prod([float(c) for c in self.factored.cardinalities]))
         if self.n > MAX_ACTIONS:
@@ -230,7 +237,7 @@ def _value_range(space: spaces.Space[Any], path: tuple[str | int, ...], kind: st
             return space.low.ravel().astype(np.int64), [int(high) - int(low) + 1 for low, high in bounds]
         raise TypeError(
             f"The observation space{where} {space} is continuous, and this agent models discrete variables; "
-            "wrap the environment with gymnasium.wrappers.DiscretizeObservation."
+            "wrap the environment with gymnasium.wrappers.DiscretizeObservation (a Box with finite bounds; clip others first)."
         )
     way_out = " wrap the environment with gymnasium.wrappers.DiscretizeAction." if kind == "action" else ""
     raise TypeError(

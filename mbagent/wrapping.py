@@ -9,6 +9,8 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.patch_gym import _patch_env
 
+from mbagent.spaces import ActionEnumeration, FactoredSpace
+
 
 def wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
     """As SB3 wraps environments, but without moving the channels of image-like observations.
@@ -18,6 +20,8 @@ def wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> Vec
     """
     if not isinstance(env, VecEnv):
         env = _patch_env(env)
+        FactoredSpace(env.observation_space)  # refuses in one sentence what SB3's wrapper would stumble over
+        ActionEnumeration(env.action_space)
         _refuse_nested(env.observation_space)
         if monitor_wrapper and not is_wrapped(env, Monitor):
             env = Monitor(env)

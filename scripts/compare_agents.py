@@ -62,7 +62,7 @@ class Args:
     resume: bool = False
     """Go on with an interrupted run of the same settings instead of starting anew."""
     report_only: bool = False
-    """Only write the report anew, from the records of the last run with the same settings."""
+    """Only write the report anew, from the records of the last run there, with that run's settings."""
 
 
 _OVERRIDES = ("steps", "seeds", "episodes", "goal_seeds", "goal_episodes", "baselines", "baseline_multiples")
@@ -83,13 +83,13 @@ def settings_of(args: Args) -> Settings:
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command line and returns its exit code."""
-    args = tyro.cli(Args, args=argv, description=__doc__)
+    args = tyro.cli(Args, args=argv, description=__doc__.splitlines()[0])
     console = Console()
     try:
         settings = settings_of(args)
         start = time.perf_counter()
         if args.report_only:
-            records = load(args.output)
+            settings, records = load(args.output)
         else:
             records = run(settings, args.output, workers=args.workers, console=console, resume=args.resume)
     except (ValueError, JobsFailedError) as error:

@@ -75,7 +75,7 @@ def _line(outcome: Outcome) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command line and returns its exit code."""
-    args = tyro.cli(Args, args=argv, description=__doc__)
+    args = tyro.cli(Args, args=argv, description=__doc__.splitlines()[0])
     console = Console()
     try:
         settings = settings_of(args)

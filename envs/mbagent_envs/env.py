@@ -58,6 +58,8 @@ def check_render_mode(render_mode: str | None) -> str | None:
 
 def check_options(options: Mapping[str, Any] | None, known: tuple[str, ...]) -> dict[str, Any]:
     """Return the options of a reset as a new dict, or raise ValueError if one is unknown."""
+    if options is not None and not isinstance(options, Mapping):
+        raise TypeError(f"reset's options must be a dict or None, but they are {options!r} of type {type(options).__name__}.")
     given = dict(options or {})
     unknown = [name for name in given if name not in known]
     if unknown:

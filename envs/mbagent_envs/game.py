@@ -238,12 +238,14 @@ def check_integer(name: str, value: object, minimum: int) -> int:
     return int(value)
 
 
-def check_number(name: str, value: object, minimum: float, maximum: float) -> float:
-    """Return ``value`` as a finite float in [minimum, maximum]; TypeError or ValueError name the argument."""
+def check_number(name: str, value: object, minimum: float, maximum: float, *, below: bool = False) -> float:
+    """Return ``value`` as a finite float in [minimum, maximum], or below the maximum; errors name the argument."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise TypeError(f"{name} must be a number, but it is {value!r} of type {type(value).__name__}.")
-    if not (minimum <= value <= maximum and np.isfinite(value)):
-        wanted = f"in [{minimum:g}, {maximum:g}]" if np.isfinite([minimum, maximum]).all() else "a finite number"
+    if not (minimum <= value <= maximum and np.isfinite(value)) or (below and value == maximum):
+        wanted = (
+            f"in [{minimum:g}, {maximum:g}{')' if below else ']'}" if np.isfinite([minimum, maximum]).all() else "a finite number"
+        )
         raise ValueError(f"{name} must be {wanted}, but it is {value}.")
     return float(value)
 

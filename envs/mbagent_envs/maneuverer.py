@@ -174,9 +174,7 @@ class Maneuverer(Game):
     def __init__(self, *, size: int = 6, wall_density: float = 0.2) -> None:
         """See the class."""
         self.size = check_integer("size", size, 2)
-        self.wall_density = check_number("wall_density", wall_density, 0.0, 1.0)
-        if self.wall_density == 1.0:
-            raise ValueError("wall_density must be in [0, 1), but it is 1, and no cell could ever be reached; take less.")
+        self.wall_density = check_number("wall_density", wall_density, 0.0, 1.0, below=True)  # 1: no cell could be reached
         goals = {
             "corner": self._corner,
             "next to target": self._next_to,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -55,6 +55,20 @@ class Settings:
     scale_episodes: int = 500
     baselines: tuple[str, ...] = BASELINES
     cases: tuple[str, ...] = tuple(case.key for case in CASES)
+
+    def __post_init__(self) -> None:
+        """Checks the ranges.
+
+        Raises:
+            ValueError: a setting is out of range.
+        """
+        for name in ("steps", "seeds", "episodes", "goal_episodes", "scale_episodes"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if self.goal_seeds < 0 or any(multiple < 1 for multiple in self.baseline_multiples):
+            raise ValueError("goal_seeds must not be negative, and baseline_multiples must be at least 1.")
+        if not self.cases:
+            raise ValueError(f"There is no case to compare on; choose from {', '.join(case.key for case in CASES)}.")
 
 
 QUICK = Settings()
@@ -116,27 +130,34 @@ def run(settings: Settings, folder: Path, *, workers: int, console: Console, res
         resume: go on with an interrupted run instead of starting anew.
 
     Raises:
-        ValueError: ``resume`` with other settings than those of the interrupted run.
+        ValueError: ``resume`` with other settings than those of the interrupted run, or no workers.
         JobsFailedError: see ``run_jobs``.
     """
+    if workers < 1:
+        raise ValueError(f"workers must be at least 1 process, got {workers}.")
     kept, noted = folder / "records", folder / "records" / "settings.json"
     text = json.dumps(asdict(settings), indent=1)
     if resume and noted.exists() and noted.read_text(encoding="utf-8") != text:
         raise ValueError(f"The run kept in {kept} had other settings; give the same ones, or leave out --resume.")
-    if not resume and kept.exists():
-        shutil.rmtree(kept)
+    if not resume:  # nothing but what an earlier run wrote
+        for stale in [*kept.glob("*.json"), *kept.glob("*.progress"), *kept.glob("errors.log")]:
+            stale.unlink()
     kept.mkdir(parents=True, exist_ok=True)
     noted.write_text(text, encoding="utf-8")
     return run_jobs(plan_jobs(settings), kept, workers=workers, console=console)
 
 
-def load(folder: Path) -> list[Record]:
-    """The records kept by an earlier ``run``.
+def load(folder: Path) -> tuple[Settings, list[Record]]:
+    """The settings and the records kept by an earlier ``run``.
 
     Raises:
         ValueError: there are none.
     """
+    noted = folder / "records" / "settings.json"
     files = [file for file in sorted((folder / "records").glob("*.json")) if file.name != "settings.json"]
-    if not files:
+    if not files or not noted.exists():
         raise ValueError(f"There are no records in {folder / 'records'}; run the comparison first.")
-    return [record for file in files for record in read_records(file)]
+    given: dict[str, Any] = json.loads(noted.read_text(encoding="utf-8"))
+    given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
+    settings = Settings(**given)
+    return settings, [record for file in files for record in read_records(file)]

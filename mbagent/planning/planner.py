@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, Protocol
+
+import numpy as np
 
 from mbagent.models.base import Actions, Floats, States, TransitionModel
 from mbagent.planning.goal import Goal
@@ -60,12 +63,16 @@ class PlannerSettings:
             "wave",
         ):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
                 raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")
+            object.__setattr__(self, name, int(value))
+        for name in ("gamma", "c_uct", "prior_visits"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0.0 <= value < math.inf:
+                raise ValueError(f"{name} must be a finite number that is not negative, got {value!r}.")
+            object.__setattr__(self, name, float(value))
         if not 0.0 < self.gamma < 1.0:
             raise ValueError(f"gamma must lie between 0 and 1, both excluded, got {self.gamma!r}.")
-        if self.c_uct < 0.0 or self.prior_visits < 0.0:
-            raise ValueError("c_uct and prior_visits must not be negative.")
         choices = {
             "leaf_values": ("machine", "rollouts"),
             "backup": ("max", "mean"),

@@ -101,7 +101,9 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, monkeypatch
     (tmp_path / "records" / plan_jobs(settings)[0].file_name).unlink()
     run(settings, tmp_path, workers=1, console=quiet(), resume=True)
     assert calls == plan_jobs(settings)[:1]
-    assert len(load(tmp_path)) < len(first)
+    kept, records = load(tmp_path)
+    assert kept == settings
+    assert len(records) < len(first)
     with pytest.raises(ValueError, match="other settings"):
         run(replace(settings, steps=7), tmp_path, workers=1, console=quiet(), resume=True)
 

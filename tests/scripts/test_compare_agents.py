@@ -40,6 +40,25 @@ def test_mistakes_get_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "There is no case 'tetris'; choose from geyser_deterministic" in capsys.readouterr().out
     assert main(["--report-only", "--output", str(tmp_path)]) == 1
     assert "run the comparison first" in capsys.readouterr().out
+    for wrong in (["--seeds", "0"], ["--episodes", "-1"], ["--baselines", "SAC"], ["--workers", "0"]):
+        assert main([*CASE, "--output", str(tmp_path), *wrong]) == 1
+        told = capsys.readouterr().out
+        assert "at least 1" in told or "choose from PPO, DQN, A2C" in told
+    assert not (tmp_path / "records").exists()
+
+
+def test_a_new_run_deletes_nothing_but_what_an_earlier_one_wrote(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("mbagent.analysis.jobs.ModelLearningAgent", FakeAgent)
+    (tmp_path / "records").mkdir()
+    (tmp_path / "records" / "precious.txt").write_text("mine")
+    options = [*TINY, "--baselines", "--no-curves", "--output", str(tmp_path)]
+    assert main(options) == main(options) == 0
+    assert (tmp_path / "records" / "precious.txt").read_text() == "mine"
+    # Other options do not matter to a page written again: it is that run's.
+    assert main(["--report-only", "--output", str(tmp_path)]) == 0
+    capsys.readouterr()
 
 
 def test_full_is_more_thorough_in_everything() -> None:
