@@ -104,8 +104,6 @@ class ModelLearningAgent(SavableAlgorithm):
         _init_setup_model: bool = True,
     ) -> None:
         """See the class."""
-        if env is None and _init_setup_model:
-            raise ValueError("env must be an environment or a registered id, got None; load() is the way to one without.")
         seed = check_seed(seed)
         super().__init__(
             policy,
@@ -152,6 +150,8 @@ class ModelLearningAgent(SavableAlgorithm):
         return PlannerSettings(**own, seed=self._planning_seed, **self.policy_kwargs)
 
     def _setup_model(self) -> None:
+        if not hasattr(self, "observation_space"):
+            raise ValueError("env must be an environment or a registered id, got None; load() is the way to an agent without.")
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         settings = self._settings()
