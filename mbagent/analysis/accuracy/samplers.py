@@ -39,7 +39,7 @@ class FitOptions:
         targets: "batch": P(y | X), the frequencies, as in 3.1's first method; "online": every observation's own y,
             one update each, its second, "slower and sensitive to the order of training".
         loss: "squared", as in backpropagation's textbook form, or "cross_entropy".
-        learning_rate: largest rate of the batch method's schedule.
+        learning_rate: largest rate of the batch method's schedule; the on-line method takes a third of it throughout.
         batch_size: distinct observations of an update, batch targets.
         sweeps: passes over all variables for one sample; the paper says "repeat".
         real_guess: start from the predictor's probabilities, as step 2 reads, rather than from bits drawn from them.
@@ -63,6 +63,7 @@ def paper_config(d: int, options: FitOptions) -> NeuralConfig:
         config.training,
         loss=options.loss,
         learning_rate=options.learning_rate,
+        online_learning_rate=options.learning_rate / 3.0,
         batch_size=options.batch_size,
         epochs=float(options.iterations),
         min_steps=1,
