@@ -39,9 +39,9 @@ class FitOptions:
         targets: "batch": P(y | X), the frequencies, as in 3.1's first method; "online": every observation's own y,
             one update each, its second, "slower and sensitive to the order of training".
         loss: "squared", as in backpropagation's textbook form, or "cross_entropy".
-        learning_rate: largest rate of the batch method's schedule (0.03 left trial 1a at .85, 0.1 at .94); the on-line
+        learning_rate: largest rate of the batch method's schedule (trial 1a: 0.03 .85, 0.1 .94, 0.2 .97); the on-line
             method takes a third of it throughout.
-        batch_size: distinct observations of an update, batch targets.
+        updates: updates an iteration makes, each on as many observations (batch targets).
         sweeps: passes over all variables for one sample; the paper says "repeat".
         real_guess: start from the predictor's probabilities, as step 2 reads, rather than from bits drawn from them.
         rounding: "2d^2+1" hidden nodes in d groups: "down" is 2d a group, "up" 2d + 1.
@@ -50,22 +50,22 @@ class FitOptions:
     iterations: int = 250
     targets: Literal["batch", "online"] = "batch"
     loss: Literal["squared", "cross_entropy"] = "cross_entropy"
-    learning_rate: float = 0.1
-    batch_size: int = 4
+    learning_rate: float = 0.2
+    updates: int = 4
     sweeps: int = 5
     real_guess: bool = False
     rounding: Literal["down", "up"] = "down"
 
 
-def paper_config(d: int, options: FitOptions) -> NeuralConfig:
-    """The paper's two networks for d variables."""
+def paper_config(d: int, n: int, options: FitOptions) -> NeuralConfig:
+    """The paper's two networks for d variables, and how they are fitted to n observations."""
     config = NeuralConfig.paper(d)
     training = replace(
         config.training,
         loss=options.loss,
         learning_rate=options.learning_rate,
         online_learning_rate=options.learning_rate / 3.0,
-        batch_size=options.batch_size,
+        batch_size=max(1, n // options.updates),
         epochs=float(options.iterations),
         min_steps=1,
         max_steps=10**9,
@@ -98,7 +98,7 @@ def causal_config(d: int) -> NeuralConfig:
 
 def fit_paper(data: Observations, options: FitOptions, seed: int) -> tuple[NeuralTransitionModel, NeuralTransitionModel]:
     """(predictor alone, predictor and conditioner combined); the predictor is the same."""
-    config = paper_config(data.d, options)
+    config = paper_config(data.d, data.outputs.shape[0] * data.outputs.shape[1], options)
     cards = (2,) * data.d
     combined = NeuralTransitionModel(cards, 1, config, seed=seed)
     if options.targets == "batch":

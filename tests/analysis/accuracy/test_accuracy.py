@@ -67,8 +67,8 @@ def test_both_ways_of_training_learn(targets: str, iterations: int) -> None:
 
 def test_hidden_nodes_are_those_of_the_paper() -> None:
     for rounding, size in (("down", 16), ("up", 17)):
-        config = samplers.paper_config(8, FitOptions(rounding=rounding))  # type: ignore[arg-type]
-        assert (config.hidden, config.group_size) == ((17,), size)
+        config = samplers.paper_config(8, 320, FitOptions(rounding=rounding))  # type: ignore[arg-type]
+        assert (config.hidden, config.group_size, config.training.batch_size) == ((17,), size, 80)
     # d = 2 by hand: 2 * 5 + 5 * 2 weights and 5 + 2 thresholds; 8 nodes with 2 + 1 inputs, threshold and output, and 2 more.
     assert paper_parameters(2) == (27, 42)
 
