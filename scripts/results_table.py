@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import re
+import statistics
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -56,12 +57,9 @@ def score(values: Sequence[float]) -> str:
 
 
 def new_goals(scores: Scores, case: str) -> str:
-    """The lowest share, over the new goals of a case, of the true model's score that the learned model reaches."""
+    """The lowest share, over the new goals of a case, of the true model's mean score that the learned model reaches."""
     goals = {goal for found, agent, goal in scores if found == case and agent == TRUE_MODEL and goal != "default"}
-    shares = [
-        float(interquartile_mean(scores[case, AGENT, goal]) / interquartile_mean(scores[case, TRUE_MODEL, goal]))
-        for goal in goals
-    ]
+    shares = [statistics.fmean(scores[case, AGENT, goal]) / statistics.fmean(scores[case, TRUE_MODEL, goal]) for goal in goals]
     return f"{min(shares):.2f}" if shares else "–"
 
 
