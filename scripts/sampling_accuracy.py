@@ -35,7 +35,7 @@ class Args:
     """Measure how accurately models sample transition probabilities."""
 
     full: bool = False
-    """All trials with 20 data sets each, 5 of the largest (about two hours on two cores)."""
+    """All trials with 20 data sets each, 5 of the largest (hours)."""
     trials: tuple[str, ...] | None = None
     """Which of 1a, 1b, 2a, 2b, 2c, 3; by default all but 3, with --full all."""
     seeds: int | None = None
