@@ -1,7 +1,7 @@
 """Measures how accurately models sample transition probabilities (the paper's section 3.3), beside the paper's figures.
 
 python scripts/sampling_accuracy.py                         # quick: 3 data sets a trial, without the largest trial
-python scripts/sampling_accuracy.py --full                  # 20 data sets a trial, 5 of the largest
+python scripts/sampling_accuracy.py --full                  # 20 data sets a trial, 60 of the tiniest, 5 of the largest
 python scripts/sampling_accuracy.py --trials 2a --fit.targets online
 
 """
@@ -22,7 +22,8 @@ import tyro
 from rich.console import Console
 
 from mbagent.analysis.accuracy.experiment import FIRST_SCORED_SEED, Outcome, Settings, collect, plan, run_task
-from mbagent.analysis.accuracy.page import save_csv, write_page
+from mbagent.analysis.accuracy.page import write_page
+from mbagent.analysis.accuracy.results import first_points, load_points, load_scores, save_points, save_scores
 from mbagent.analysis.accuracy.samplers import FitOptions
 from mbagent.analysis.accuracy.trials import TRIALS
 from mbagent.analysis.parallel import run_all
@@ -35,7 +36,7 @@ class Args:
     """Measure how accurately models sample transition probabilities."""
 
     full: bool = False
-    """All trials with 20 data sets each, 5 of the largest (hours)."""
+    """All trials with 20 data sets each, 60 of the tiniest, 5 of the largest (about an hour and a half)."""
     trials: tuple[str, ...] | None = None
     """Which of 1a, 1b, 2a, 2b, 2c, 3; by default all but 3, with --full all."""
     seeds: int | None = None
@@ -54,6 +55,10 @@ class Args:
     """How the paper's networks are fitted."""
     output: Path = Path("results/sampling_accuracy")
     """Folder for the page and results.csv."""
+    resume: bool = False
+    """Keep the data sets that results.csv in the folder already has; they must have been measured with the same options."""
+    report_only: bool = False
+    """Only write the page again, from what an earlier run left in the folder."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Number of processes, each with one thread."""
 
@@ -84,11 +89,18 @@ def main(argv: list[str] | None = None) -> int:
         console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
         return 1
     args.output.mkdir(parents=True, exist_ok=True)
-    outcomes = list(run_all(run_task, tasks, workers=args.workers, console=console, name=_line))
-    save_csv(args.output / "results.csv", collect(outcomes))
+    table, points = args.output / "results.csv", args.output / "points.npz"
+    kept, drawn = (load_scores(table), load_points(points)) if args.resume or args.report_only else ([], {})
+    done = {(score.trial, score.seed) for score in kept}
+    todo = [task for task in tasks if (task.trial, task.seed) not in done and not args.report_only]
+    outcomes = []
+    for outcome in run_all(run_task, todo, workers=args.workers, console=console, name=_line):
+        outcomes.append(outcome)
+        save_scores(table, [*kept, *collect(outcomes)])
+        save_points(points, {**first_points(outcomes), **drawn})
     given = sys.argv[1:] if argv is None else argv
     command = " ".join(["python scripts/sampling_accuracy.py", *given])
-    write_page(args.output / "report.html", outcomes, settings, command)
+    write_page(args.output / "report.html", load_scores(table), load_points(points), settings, command)
     console.print(f"Wrote {args.output / 'report.html'} and {args.output / 'results.csv'}.")
     return 0
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from mbagent.models.base import TransitionModel
+from mbagent.models.base import BaseTransitionModel, TransitionModel
 from mbagent.models.config import NeuralConfig
+from mbagent.models.forecasts import DirectForecastModel
 from mbagent.models.neural import NeuralTransitionModel
+from mbagent.models.plane_strings import PlaneStringPredictor
 from mbagent.models.planes import PlanePredictor
 from mbagent.models.tabular import TabularModel
 from mbagent.models.training import TrainingConfig
@@ -21,7 +23,11 @@ PLANE_TRAINING = TrainingConfig(batch_size=128, weight_decay=1e-3, epochs=40.0, 
 of a model, so training goes on for long."""
 
 
-def build_auto(space: FactoredSpace, n_actions: int, learning_rate: float) -> TransitionModel:
+DIRECT_STEPS = tuple(range(2, 16))
+"""Numbers of steps that the model "direct" learns a network of its own for."""
+
+
+def build_auto(space: FactoredSpace, n_actions: int, learning_rate: float) -> BaseTransitionModel:
     """Weights shared over positions where the observation is a stack of planes, else predictor and causal conditioner."""
     planes = space.planes
     if planes is None:
@@ -33,6 +39,33 @@ def build_auto(space: FactoredSpace, n_actions: int, learning_rate: float) -> Tr
         n_actions,
         config,
         body=lambda codec, generator: PlanePredictor(codec, planes, generator=generator),
+    )
+
+
+def build_string(space: FactoredSpace, n_actions: int, learning_rate: float, n_steps: int) -> NeuralTransitionModel:
+    """A model of states ``n_steps`` apart whose action is a string of as many (paper 4.2)."""
+    planes, cards = space.planes, space.cardinalities
+    if planes is None:
+        config = NeuralConfig(training=replace(TrainingConfig(), learning_rate=learning_rate))
+        return NeuralTransitionModel(cards, n_actions, config, n_steps=n_steps)
+    config = NeuralConfig(conditioner=None, training=replace(PLANE_TRAINING, learning_rate=learning_rate))
+    return NeuralTransitionModel(
+        cards,
+        n_actions,
+        config,
+        body=lambda codec, generator: PlaneStringPredictor(codec, planes, generator=generator),
+        n_steps=n_steps,
+    )
+
+
+def build_direct(
+    space: FactoredSpace, n_actions: int, learning_rate: float, steps: Sequence[int] = DIRECT_STEPS
+) -> DirectForecastModel:
+    """The model of ``build_auto``, and beside it one model for each of several numbers of steps."""
+    return DirectForecastModel(
+        build_auto(space, n_actions, learning_rate),
+        lambda n_steps: build_string(space, n_actions, learning_rate, n_steps),
+        tuple(steps),
     )
 
 
@@ -52,7 +85,12 @@ def build_tabular(space: FactoredSpace, n_actions: int, learning_rate: float) ->
     return TabularModel(space.cardinalities, n_actions)
 
 
-_FACTORIES: dict[str, ModelFactory] = {"auto": build_auto, "paper": build_paper, "tabular": build_tabular}
+_FACTORIES: dict[str, ModelFactory] = {
+    "auto": build_auto,
+    "paper": build_paper,
+    "tabular": build_tabular,
+    "direct": build_direct,
+}
 
 
 def register_model(name: str, factory: ModelFactory) -> None:

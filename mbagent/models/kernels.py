@@ -30,11 +30,15 @@ class Layout(NamedTuple):
         outputs: cardinalities of the output factors, int64 [O]; the first F are the state's.
         start: first column of each output factor, int64 [O].
         n_state_columns: columns of the state; those of the action follow.
+        n_actions: actions A of a single step.
+        n_steps: actions in a string, see ``FactorCodec``.
     """
 
     outputs: Ints
     start: Ints
     n_state_columns: int
+    n_actions: int
+    n_steps: int
 
 
 class DenseWeights(NamedTuple):
@@ -47,7 +51,7 @@ class DenseWeights(NamedTuple):
         sizes: of the hidden layers, int64 [L].
         last: of the output columns, [H, n_columns].
         last_bias: [n_columns].
-        stay: the residual path's, [A, n_state_columns]; zero where there is none.
+        stay: the residual path's, [n_steps * A, n_state_columns]; zero where there is none.
         activation: one of the codes above.
     """
 
@@ -100,7 +104,7 @@ def _activate(values: Floats32, n: int, code: int) -> None:
 
 @compiled
 def active_columns(states: Ints, b: int, action: int, layout: Layout, out: Ints) -> int:
-    """Writes the input columns of row b that are 1 to ``out`` and returns how many there are; the action's is last."""
+    """Writes the input columns of row b that are 1 to ``out`` [F + n_steps]; returns how many; the actions' come last."""
     n = 0
     for factor in range(states.shape[1]):
         value = states[b, factor]
@@ -110,8 +114,22 @@ def active_columns(states: Ints, b: int, action: int, layout: Layout, out: Ints)
         elif value == 1:
             out[n] = layout.start[factor]
             n += 1
-    out[n] = layout.n_state_columns + action
-    return n + 1
+    for step in range(layout.n_steps):
+        out[n + step] = layout.n_state_columns + step * layout.n_actions + action % layout.n_actions
+        action //= layout.n_actions
+    return n + layout.n_steps
+
+
+@compiled
+def _add_residual(active: Ints, n_active: int, layout: Layout, stay: Floats32, columns: Floats32) -> None:
+    """Adds what leads each state column to itself: its weight where it is 1, minus its weight where it is 0."""
+    n_on = n_active - layout.n_steps
+    for step in range(n_on, n_active):
+        row = stay[active[step] - layout.n_state_columns]
+        for column in range(layout.n_state_columns):
+            columns[column] -= row[column]
+        for a in range(n_on):
+            columns[active[a]] += np.float32(2.0) * row[active[a]]
 
 
 @compiled
@@ -154,17 +172,14 @@ def dense_logits(states: Ints, actions: Ints, layout: Layout, dense: DenseWeight
     """A dense predictor's logits, float32 [B, O, K]; values a factor lacks are at -1e9."""
     n_outputs, width = len(layout.outputs), layout.outputs.max()
     logits = np.full((len(states), n_outputs, width), np.float32(-1e9), dtype=np.float32)
-    active = np.empty(states.shape[1] + 1, dtype=np.int64)
+    active = np.empty(states.shape[1] + layout.n_steps, dtype=np.int64)
     now = np.empty(dense.last.shape[0], dtype=np.float32)
     after = np.empty_like(now)
     columns = np.empty(len(dense.last_bias), dtype=np.float32)
     for b in range(len(states)):
         n_active = active_columns(states, b, actions[b], layout, active)
         _dense_columns(active, n_active, dense, now, after, columns)
-        for column in range(layout.n_state_columns):
-            columns[column] -= dense.stay[actions[b], column]
-        for a in range(n_active - 1):
-            columns[active[a]] += np.float32(2.0) * dense.stay[actions[b], active[a]]
+        _add_residual(active, n_active, layout, dense.stay, columns)
         for i in range(n_outputs):
             start = layout.start[i]
             if layout.outputs[i] == 2:

@@ -44,6 +44,8 @@ class FactorCodec(nn.Module):
     Args:
         cardinalities: number of values of each state factor, length F.
         n_actions: number of enumerated actions A.
+        n_steps: actions in the string that is an action of the model (paper 4.2: "each action in the string occupies an
+            additional group of inputs"). The string's number has the first action as its lowest digit in base A.
 
     Attributes:
         outputs: cardinalities of the O = F + 1 output factors; the last is ``terminated``.
@@ -52,25 +54,25 @@ class FactorCodec(nn.Module):
         n_columns: columns of the output factors.
     """
 
-    def __init__(self, cardinalities: Sequence[int], n_actions: int) -> None:
+    def __init__(self, cardinalities: Sequence[int], n_actions: int, n_steps: int = 1) -> None:
         super().__init__()
         self.cardinalities = tuple(int(c) for c in cardinalities)
         self.outputs = (*self.cardinalities, 2)
-        self.n_actions = int(n_actions)
+        self.n_actions, self.n_steps = int(n_actions), int(n_steps)
         self.width = max(self.outputs)
         factor, value = _columns(self.outputs)
         self.n_columns = len(factor)
         self.n_state_columns = int((factor < len(self.cardinalities)).sum())
-        self.n_inputs = self.n_state_columns + self.n_actions
+        self.n_inputs = self.n_state_columns + self.n_steps * self.n_actions
         self.all_binary = all(c == 2 for c in self.outputs)
         self.column_factor: Tensor
         self.column_value: Tensor
         self.slots: Tensor
         self.floor: Tensor
-        self.action_columns: Tensor
+        self.single_actions: Tensor
         self._constant("column_factor", torch.from_numpy(factor))
         self._constant("column_value", torch.from_numpy(value))
-        self._constant("action_columns", torch.eye(self.n_actions))
+        self._constant("single_actions", torch.eye(self.n_actions))
         self._constant("slots", torch.from_numpy(factor * self.width + value))
         possible = np.arange(self.width) < np.asarray(self.outputs)[:, None]
         self._constant("floor", torch.from_numpy(np.where(possible, 0.0, IMPOSSIBLE).astype(np.float32)))
@@ -82,7 +84,17 @@ class FactorCodec(nn.Module):
         """Columns of a state and an action, float [B, n_inputs], from int64 [B, F] and int64 [B]."""
         n = self.n_state_columns
         state = self._one_hot(states, self.column_factor[:n], self.column_value[:n])
-        return torch.cat((state, self.action_columns[actions]), dim=1)
+        return torch.cat((state, self.action_columns(actions)), dim=1)
+
+    def action_columns(self, actions: Tensor) -> Tensor:
+        """Columns of the actions of a string, one-hot, step after step: float [B, n_steps * A] from int64 [B]."""
+        return torch.cat([self.single_actions[step] for step in self.action_steps(actions)], dim=1)
+
+    def action_steps(self, actions: Tensor) -> list[Tensor]:
+        """The actions of a string, each int64 [B], the first first."""
+        if self.n_steps == 1:
+            return [actions]
+        return [actions // self.n_actions**k % self.n_actions for k in range(self.n_steps)]
 
     def targets(self, factors: Tensor) -> Tensor:
         """Columns of output factors, float [B, n_columns], from int64 [B, O]."""
@@ -175,7 +187,7 @@ class DensePredictor(nn.Module):
         codec: the factors.
         hidden: sizes of the hidden layers (the paper: one of 2d + 1).
         activation: of the hidden nodes (the paper: sigmoid).
-        residual: adds a learned path from each s_i to s'_i, one weight for each (action, factor).
+        residual: adds a learned path from each s_i to s'_i, one weight for each (action column, factor).
         dropout: share of hidden nodes zeroed in each training step.
         generator: source of the first weights.
     """
@@ -201,7 +213,9 @@ class DensePredictor(nn.Module):
             self.out.weight.data *= 0.1  # start near "nothing changes"
         self.stay: nn.Parameter | None = None
         if residual:
-            self.stay = nn.Parameter(torch.full((codec.n_actions, codec.n_state_columns), RESIDUAL_START))
+            self.stay = nn.Parameter(
+                torch.full((codec.n_actions * codec.n_steps, codec.n_state_columns), RESIDUAL_START / codec.n_steps)
+            )
 
     def forward(self, states: Tensor, actions: Tensor) -> Tensor:
         """See Predictor."""

@@ -40,9 +40,10 @@ class NeuralTransitionModel(BaseTransitionModel):
 
     Args:
         cardinalities: number of values of each state factor, length F.
-        n_actions: number of enumerated actions A.
+        n_actions: number of enumerated actions A of a single step.
         config: see NeuralConfig.
         body: builds another predictor body than the dense one.
+        n_steps: actions in the string that is an action of this model (paper 4.2); see ``FactorCodec``.
         seed: of the first weights; ``fit`` starts from its own seed's.
     """
 
@@ -53,11 +54,12 @@ class NeuralTransitionModel(BaseTransitionModel):
         config: NeuralConfig | None = None,
         *,
         body: BodyFactory | None = None,
+        n_steps: int = 1,
         seed: int = 0,
     ) -> None:
-        super().__init__(cardinalities, n_actions)
+        super().__init__(cardinalities, n_actions**n_steps)
         self.config = config or NeuralConfig()
-        self.codec = FactorCodec(self.cardinalities, self.n_actions)
+        self.codec = FactorCodec(self.cardinalities, n_actions, n_steps)
         self._body = body
         self._layout = pack_layout(self.codec)
         self._dropout = self.config.dropout_for(len(self.cardinalities))

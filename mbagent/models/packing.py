@@ -59,11 +59,12 @@ def pack_layout(codec: FactorCodec) -> Layout:
     """Where the codec's factors lie among its columns."""
     factor = codec.column_factor.numpy()
     start = np.searchsorted(factor, np.arange(len(codec.outputs))).astype(np.int64)
-    return Layout(np.asarray(codec.outputs, dtype=np.int64), start, codec.n_state_columns)
+    return Layout(np.asarray(codec.outputs, dtype=np.int64), start, codec.n_state_columns, codec.n_actions, codec.n_steps)
 
 
 def pack_dense(predictor: DensePredictor) -> DenseWeights:
     """A dense predictor's weights, padded to its widest hidden layer."""
+    codec = predictor.codec
     layers = [layer for layer in predictor.layers if isinstance(layer, Affine)]
     sizes = np.asarray([len(layer.bias) for layer in layers], dtype=np.int64)
     depth, width = len(sizes), int(sizes.max(initial=1))
@@ -76,10 +77,10 @@ def pack_dense(predictor: DensePredictor) -> DenseWeights:
     out = _array(predictor.out.weight).T
     first, last = out, np.zeros((width, out.shape[1]), dtype=np.float32)
     if depth:
-        first = np.zeros((predictor.codec.n_inputs, width), dtype=np.float32)
+        first = np.zeros((codec.n_inputs, width), dtype=np.float32)
         first[:, : sizes[0]] = _array(layers[0].weight).T
         last[: sizes[-1]] = out
-    stay = np.zeros((predictor.codec.n_actions, predictor.codec.n_state_columns), dtype=np.float32)
+    stay = np.zeros((codec.n_actions * codec.n_steps, codec.n_state_columns), dtype=np.float32)
     if predictor.stay is not None:
         stay += _array(predictor.stay)
     return DenseWeights(

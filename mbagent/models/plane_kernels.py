@@ -1,8 +1,7 @@
 """The plane predictor (``planes.py``) compiled: torch trains, numba samples.
 
-Rows are worked on in blocks of one fixed size, so a row's result does not depend on the rows beside it. Shapes: C'
-input channels (planes, or
-planes times values), H rows, W columns, D hidden channels, A actions.
+Each row is computed by itself, so its result does not depend on the rows beside it. Shapes: C' input channels (planes,
+or planes times values), H rows, W columns, D hidden channels, A actions.
 """
 
 from __future__ import annotations
@@ -18,10 +17,6 @@ from mbagent_envs._compiled import compiled
 
 Floats32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
-
-
-BLOCK = 8
-"""Rows whose products are taken in one call, always this many: other sizes could round differently."""
 
 
 class PlaneWeights(NamedTuple):
@@ -100,30 +95,25 @@ def plane_logits(states: Ints, actions: Ints, w: PlaneWeights, width: int) -> Fl
     logits = np.zeros((n_rows, n_factors + 1, width), dtype=np.float32)
     plain = np.empty((height, columns, hidden), dtype=np.float32)
     padded = np.zeros((height + 2) * (columns + 2) * hidden, dtype=np.float32)
-    patches = np.zeros((BLOCK, cells, 9 * hidden), dtype=np.float32)
-    above = np.empty((BLOCK * cells, hidden), dtype=np.float32)
-    read = np.empty((BLOCK * cells, len(w.out_bias)), dtype=np.float32)
-    top = np.empty((BLOCK, hidden), dtype=np.float32)
-    bias, out_bias = np.empty(hidden, dtype=np.float32), np.empty(len(w.out_bias), dtype=np.float32)
-    for start in range(0, n_rows, BLOCK):
-        n = min(BLOCK, n_rows - start)
-        for j in range(n):
-            b = start + j
-            if b == 0 or not _same(states, b):
-                _first_layer(states[b], w, plain)
-            _activate_first(plain, w.action[actions[b]], padded, patches[j], top[j])
-        np.dot(patches.reshape(BLOCK * cells, 9 * hidden), w.second, above)
-        for j in range(n):
-            _mix(top[j], w.second_top, w.second_bias, bias)
-            _activate_second(above[j * cells : (j + 1) * cells], bias, top[j])
+    patches = np.zeros((cells, 9 * hidden), dtype=np.float32)
+    above, read = np.empty((cells, hidden), dtype=np.float32), np.empty((cells, len(w.out_bias)), dtype=np.float32)
+    top, bias = np.empty((2, hidden), dtype=np.float32)
+    out_bias = np.empty(len(w.out_bias), dtype=np.float32)
+    for b in range(n_rows):
+        if b == 0 or not _same(states, b):
+            _first_layer(states[b], w, plain)
+        _activate_first(plain, w.action[actions[b]], padded, patches, top)
+        # One product for each state: in a product for several, some processors round a row by its place among them.
+        np.dot(patches, w.second, above)
+        _mix(top, w.second_top, w.second_bias, bias)
+        _activate_second(above, bias, top)
         np.dot(above, w.out, read)
-        for j in range(n):
-            _mix(top[j], w.out_top, w.out_bias, out_bias)
-            _read_out(states[start + j], w, read[j * cells : (j + 1) * cells], out_bias, columns, logits[start + j])
-            total = w.end_bias[0]
-            for d in range(hidden):
-                total += top[j, d] * w.end[d]
-            logits[start + j, n_factors, 1] = total
+        _mix(top, w.out_top, w.out_bias, out_bias)
+        _read_out(states[b], w, read, out_bias, columns, logits[b])
+        total = w.end_bias[0]
+        for d in range(hidden):
+            total += top[d] * w.end[d]
+        logits[b, n_factors, 1] = total
     return logits
 
 

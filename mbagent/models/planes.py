@@ -50,21 +50,11 @@ class PlanePredictor(nn.Module):
         ones = torch.ones_like(cells[:, :1])
         action = self.action[actions][:, :, None, None]
         hidden = functional.relu(self.first(torch.cat((cells, ones), dim=1)) + action)
-        hidden = functional.relu(self.second(hidden) + self.second_top(_maximum(hidden))[:, :, None, None])
-        top = _maximum(hidden)
+        hidden = functional.relu(self.second(hidden) + self.second_top(maximum(hidden))[:, :, None, None])
+        top = maximum(hidden)
         stay = self.stay.repeat_interleave(self.values)[:, None, None]
         planes = self.out(hidden) + self.out_top(top)[:, :, None, None] + stay * (2.0 * cells - 1.0)
-        return self._logits(planes, self.end(top))
-
-    def _logits(self, planes: Tensor, end: Tensor) -> Tensor:
-        layout = self.layout
-        split = planes.view(len(planes), layout.channels, self.values, layout.height, layout.width)
-        order = (0, 3, 4, 1, 2) if layout.channels_last else (0, 1, 3, 4, 2)
-        cells = split.permute(order).reshape(len(planes), -1, self.values)
-        if self.values == 1:
-            return self.codec.logits(torch.cat((cells[:, :, 0], end), dim=1))
-        last = torch.cat((torch.zeros_like(end), end, end.new_zeros(len(end), self.values - 2)), dim=1)
-        return torch.cat((cells, last[:, None]), dim=1) + self.codec.floor
+        return logits_of(planes, self.end(top), self.layout, self.codec)
 
 
 def cells_of(states: Tensor, layout: PlaneLayout, codec: FactorCodec) -> Tensor:
@@ -76,6 +66,18 @@ def cells_of(states: Tensor, layout: PlaneLayout, codec: FactorCodec) -> Tensor:
     if codec.all_binary:
         return cells.to(torch.float32)
     return functional.one_hot(cells, codec.width).to(torch.float32).permute(0, 1, 4, 2, 3).flatten(1, 2)
+
+
+def logits_of(planes: Tensor, end: Tensor, layout: PlaneLayout, codec: FactorCodec) -> Tensor:
+    """Logits [B, O, K] from those of the planes [B, C * K, H, W] (bits: [B, C, H, W]) and of ``terminated`` [B, 1]."""
+    values = planes.shape[1] // layout.channels
+    split = planes.view(len(planes), layout.channels, values, layout.height, layout.width)
+    order = (0, 3, 4, 1, 2) if layout.channels_last else (0, 1, 3, 4, 2)
+    cells = split.permute(order).reshape(len(planes), -1, values)
+    if codec.all_binary:
+        return codec.logits(torch.cat((cells[:, :, 0], end), dim=1))
+    last = torch.cat((torch.zeros_like(end), end, end.new_zeros(len(end), values - 2)), dim=1)
+    return torch.cat((cells, last[:, None]), dim=1) + codec.floor
 
 
 class Convolution(nn.Module):
@@ -92,6 +94,6 @@ class Convolution(nn.Module):
         return functional.conv2d(planes, self.weight, self.bias, padding="same")
 
 
-def _maximum(planes: Tensor) -> Tensor:
+def maximum(planes: Tensor) -> Tensor:
     """The global maximum [B, C] of each plane [B, C, H, W]."""
     return planes.amax(dim=(2, 3))

@@ -104,7 +104,7 @@ def sample_causal(
     """
     n_outputs = len(layout.outputs)
     factors = np.empty((len(states), n_outputs), dtype=np.int64)
-    active, shown = np.empty(n_outputs + 1, dtype=np.int64), np.empty(n_outputs, dtype=np.int64)
+    active, shown = np.empty(n_outputs + layout.n_steps, dtype=np.int64), np.empty(n_outputs, dtype=np.int64)
     hidden = np.empty(group.bias.shape[1], dtype=np.float32)
     row_logits = np.empty(logits.shape[2], dtype=np.float32)
     given = np.empty((1, 1, logits.shape[2]), dtype=np.float64)
@@ -146,7 +146,7 @@ def log_prob_causal(
     """Log-probability [B] of the outcomes ``factors`` [B, O] under exactly what ``sample_causal`` draws."""
     n_outputs = len(layout.outputs)
     result = np.zeros(len(states), dtype=np.float64)
-    active, shown = np.empty(n_outputs + 1, dtype=np.int64), np.empty(n_outputs, dtype=np.int64)
+    active, shown = np.empty(n_outputs + layout.n_steps, dtype=np.int64), np.empty(n_outputs, dtype=np.int64)
     hidden = np.empty(group.bias.shape[1], dtype=np.float32)
     row_logits = np.empty(logits.shape[2], dtype=np.float32)
     given = np.empty(logits.shape[2], dtype=np.float64)
@@ -240,7 +240,7 @@ def sample_sweeps(
     """
     n_outputs, size = len(layout.outputs), group.bias.shape[1]
     factors = np.empty((len(states), n_outputs), dtype=np.int64)
-    active, order = np.empty(n_outputs + 1, dtype=np.int64), np.empty(n_outputs, dtype=np.int64)
+    active, order = np.empty(n_outputs + layout.n_steps, dtype=np.int64), np.empty(n_outputs, dtype=np.int64)
     guess = np.empty(group.others.shape[1], dtype=np.float32)
     hidden, known = np.empty(size, dtype=np.float32), np.empty((n_outputs, size), dtype=np.float32)
     row_logits = np.empty(logits.shape[2], dtype=np.float32)

@@ -93,7 +93,7 @@ def _causal(
     n_outputs = probs.shape[1]
     p, found = new_particles(n_grid, n_outputs), room(len(states), n_grid, n_outputs)
     base, still_open, columns = np.empty((3, n_outputs), dtype=np.int64)
-    active = np.empty(n_outputs + 1, dtype=np.int64)
+    active = np.empty(n_outputs + layout.n_steps, dtype=np.int64)
     known, hidden = np.empty((2, group.bias.shape[1]), dtype=np.float32)
     row_logits = np.empty(probs.shape[2], dtype=np.float32)
     values, total = np.empty(probs.shape[2], dtype=np.float64), 0

@@ -31,6 +31,7 @@ class TrainingConfig:
     Attributes:
         learning_rate: AdamW's largest, at a third of the one-cycle schedule.
         weight_decay: AdamW's.
+        memory: AdamW's second beta, how long squared gradients are remembered; less makes large rates safe.
         batch_size: rows of a gradient step.
         epochs: passes over the distinct rows, within the bounds on steps.
         min_steps: fewest gradient steps.
@@ -46,6 +47,7 @@ class TrainingConfig:
 
     learning_rate: float = 0.02
     weight_decay: float = 0.01
+    memory: float = 0.999
     batch_size: int = 256
     epochs: float = 30.0
     min_steps: int = 2000
@@ -246,7 +248,7 @@ class Trainer:
             "weight_decay": self.config.weight_decay,
         }
         free = {"params": [p for p in module.parameters() if p.ndim <= 1], "weight_decay": 0.0}
-        return torch.optim.AdamW([decayed, free], lr=self.config.learning_rate, fused=True)
+        return torch.optim.AdamW([decayed, free], lr=self.config.learning_rate, betas=(0.9, self.config.memory), fused=True)
 
 
 def _descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib as mpl
-import numpy as np
 from matplotlib.figure import Figure
 
-from mbagent.analysis.accuracy.experiment import Draws, Outcome, Score, Settings, collect
+from mbagent.analysis.accuracy.experiment import Draws, Score, Settings
+from mbagent.analysis.accuracy.results import Points
 from mbagent.analysis.accuracy.samplers import CAUSAL, COMBINED, PREDICTOR
 from mbagent.analysis.accuracy.summary import MEASURES, Line, paper_parameters, statements, table
 from mbagent.analysis.accuracy.trials import TRIALS, Trial
@@ -29,16 +28,15 @@ class _Headline:
     variation: float
 
 
-def write_page(path: Path, outcomes: Sequence[Outcome], settings: Settings, command: str) -> None:
+def write_page(path: Path, scores: Sequence[Score], points: Points, settings: Settings, command: str) -> None:
     """Writes the HTML page, pictures and all, into one file."""
-    scores = collect(outcomes)
     tables = [(trial, table(scores, trial)) for trial in TRIALS if any(s.trial == trial.name for s in scores)]
     page = render(
         "accuracy.html.jinja",
         headline=[_headline(trial, lines) for trial, lines in tables],
         tables=tables,
         statements=statements(scores),
-        scatter=draw_scatter(outcomes),
+        scatter=draw_scatter(points),
         weights={trial.name: paper_parameters(trial.options.d) for trial, _ in tables},
         measures=MEASURES,
         draws=_DRAWS,
@@ -46,14 +44,6 @@ def write_page(path: Path, outcomes: Sequence[Outcome], settings: Settings, comm
         command=command,
     )
     path.write_text(page, encoding="utf-8")
-
-
-def save_csv(path: Path, scores: Sequence[Score]) -> None:
-    """Writes ``results.csv``, a line for each sampler and data set."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(Score)])
-        writer.writeheader()
-        writer.writerows(asdict(score) for score in scores)
 
 
 def _headline(trial: Trial, lines: Sequence[Line]) -> _Headline:
@@ -70,10 +60,9 @@ def _headline(trial: Trial, lines: Sequence[Line]) -> _Headline:
     )
 
 
-def draw_scatter(outcomes: Sequence[Outcome]) -> bytes:
-    """Observed against inferred probabilities, one panel a trial, from each trial's first data set."""
-    first = {o.task.trial: o for o in sorted(outcomes, key=lambda o: o.task.seed, reverse=True)}
-    names = [trial.name for trial in TRIALS if trial.name in first]
+def draw_scatter(points: Points) -> bytes:
+    """Observed against inferred probabilities, one panel a trial."""
+    names = [trial.name for trial in TRIALS if (trial.name, PREDICTOR) in points]
     columns = min(3, len(names))
     rows = -(-len(names) // columns)
     with mpl.rc_context(FIGURE_STYLE):
@@ -82,17 +71,11 @@ def draw_scatter(outcomes: Sequence[Outcome]) -> bytes:
         for axes in grid.flat[len(names) :]:
             axes.set_visible(False)
         for axes, name in zip(grid.flat, names, strict=False):
-            points = first[name].points
             for sampler, marker, colour in ((PREDICTOR, "D", "#b8bfc8"), (COMBINED, "x", "#1f2630")):
-                p, q = _thinned(points[sampler]).T
+                p, q = points[name, sampler].T
                 axes.scatter(p, q, s=12, marker=marker, color=colour, linewidths=0.8, alpha=0.8)
             axes.plot([0, 1], [0, 1], color="#d1495b", linewidth=0.8, zorder=0)
             axes.set_title(f"Trial {name}", loc="left")
             axes.set_xlabel("observed")
             axes.set_ylabel("inferred")
         return to_png(figure)
-
-
-def _thinned(points: np.ndarray, most: int = 4000) -> np.ndarray:
-    """At most about ``most`` of the points [M, 2]."""
-    return points[:: max(1, len(points) // most)]

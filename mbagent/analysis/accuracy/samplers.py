@@ -39,8 +39,8 @@ class FitOptions:
         targets: "batch": P(y | X), the frequencies, as in 3.1's first method; "online": every observation's own y,
             one update each, its second, "slower and sensitive to the order of training".
         loss: "squared", as in backpropagation's textbook form, or "cross_entropy".
-        learning_rate: largest rate of the batch method's schedule (trial 1a: 0.03 .85, 0.1 .94, 0.2 .97); the on-line
-            method takes a third of it throughout.
+        learning_rate: largest rate of the batch method's schedule; the on-line method takes a third of it throughout.
+        memory: AdamW's second beta (batch targets).
         updates: updates an iteration makes, each on as many observations (batch targets).
         sweeps: passes over all variables for one sample; the paper says "repeat".
         real_guess: start from the predictor's probabilities, as step 2 reads, rather than from bits drawn from them.
@@ -50,7 +50,8 @@ class FitOptions:
     iterations: int = 250
     targets: Literal["batch", "online"] = "batch"
     loss: Literal["squared", "cross_entropy"] = "cross_entropy"
-    learning_rate: float = 0.2
+    learning_rate: float = 0.15
+    memory: float = 0.98
     updates: int = 4
     sweeps: int = 5
     real_guess: bool = False
@@ -65,6 +66,7 @@ def paper_config(d: int, n: int, options: FitOptions) -> NeuralConfig:
         loss=options.loss,
         learning_rate=options.learning_rate,
         online_learning_rate=options.learning_rate / 3.0,
+        memory=options.memory,
         batch_size=max(1, n // options.updates),
         epochs=float(options.iterations),
         min_steps=1,
@@ -84,8 +86,9 @@ def causal_config(d: int) -> NeuralConfig:
     training = TrainingConfig(
         learning_rate=0.06,
         weight_decay=0.0,
-        batch_size=1024,
-        epochs=0.0,
+        memory=0.95,
+        batch_size=1280,
+        epochs=750.0,
         min_steps=2000 if d > 2 else 1000,
         max_steps=10**9,
         validation=0.0,
@@ -127,7 +130,8 @@ def fit_causal(data: Observations, seed: int) -> NeuralTransitionModel:
 
 def fit_boltzmann(data: Observations, seed: int) -> ConditionalBoltzmannMachine:
     """The other family that the paper's discussion names."""
-    model = ConditionalBoltzmannMachine((2,) * data.d, 1, BoltzmannConfig(hidden=16 * data.d))
+    config = BoltzmannConfig(hidden=16 * data.d, learning_rate=0.05, batch_size=32, epochs=0.0, min_steps=3000, burn_in=40)
+    model = ConditionalBoltzmannMachine((2,) * data.d, 1, config)
     model.fit(data.dataset(), seed=seed)
     return model
 

@@ -10,7 +10,8 @@ from mbagent.analysis.accuracy import experiment, samplers
 from mbagent.analysis.accuracy.data import DataOptions, generate
 from mbagent.analysis.accuracy.experiment import Outcome, Score, Settings, plan, run_task
 from mbagent.analysis.accuracy.measures import total_variation, valid_mass
-from mbagent.analysis.accuracy.page import save_csv, write_page
+from mbagent.analysis.accuracy.page import write_page
+from mbagent.analysis.accuracy.results import first_points, load_points, load_scores, save_points, save_scores
 from mbagent.analysis.accuracy.samplers import COMBINED, PREDICTOR, FitOptions
 from mbagent.analysis.accuracy.summary import mean_interval, paper_parameters, statements
 from mbagent.analysis.accuracy.trials import find_trial
@@ -101,22 +102,27 @@ def quick_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     training = TrainingConfig(min_steps=20, max_steps=20, validation=0.0)
     monkeypatch.setattr(samplers, "causal_config", lambda d: NeuralConfig(hidden=(8,), dropout=0.0, training=training))
     quick = BoltzmannConfig(min_steps=10, max_steps=10, burn_in=3)
-    monkeypatch.setattr(samplers, "BoltzmannConfig", lambda hidden: quick)
+    monkeypatch.setattr(samplers, "BoltzmannConfig", lambda **_: quick)
 
 
 @pytest.mark.usefixtures("quick_fits")
 def test_a_whole_run_becomes_one_page_and_one_table(tmp_path: Path) -> None:
     settings = Settings(trials=("1a", "1b"), seeds=1, n_draws=20, fit=FitOptions(iterations=2))
     outcomes: list[Outcome] = [run_task(task) for task in plan(settings)]
-    write_page(tmp_path / "report.html", outcomes, settings, "python scripts/sampling_accuracy.py")
-    save_csv(tmp_path / "results.csv", experiment.collect(outcomes))
+    scores, points = experiment.collect(outcomes), first_points(outcomes)
+    save_scores(tmp_path / "results.csv", scores)
+    save_points(tmp_path / "points.npz", points)
+    again, points_again = load_scores(tmp_path / "results.csv"), load_points(tmp_path / "points.npz")
+    assert [repr(score) for score in again] == [repr(score) for score in scores]  # NaN equals itself here
+    assert points_again.keys() == points.keys()
+    write_page(tmp_path / "report.html", again, points_again, settings, "python scripts/sampling_accuracy.py")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "Trial 1a: d = 2, low correlation, c = 4, 4 inputs" in page
     assert "http" not in page
     lines = (tmp_path / "results.csv").read_text(encoding="utf-8").splitlines()
     assert len(lines) == 1 + 2 * 14
     assert plan(Settings())[0].trial == "3"
-    assert len(plan(Settings())) == 5 * 20 + 5
+    assert len(plan(Settings())) == 2 * 60 + 3 * 20 + 5
     assert find_trial("3").seeds == 5
 
 
