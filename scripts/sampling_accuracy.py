@@ -16,15 +16,16 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import tyro
 from rich.console import Console
 
-from mbagent.analysis.accuracy.experiment import FIRST_SCORED_SEED, Outcome, Settings, collect, plan, run_task
+from mbagent.analysis.accuracy.experiment import FIRST_SCORED_SEED, Outcome, Part, Settings, Task, collect, plan, run_task
 from mbagent.analysis.accuracy.page import write_page
-from mbagent.analysis.accuracy.results import first_points, load_points, load_scores, save_points, save_scores
+from mbagent.analysis.accuracy.results import Points, first_points, load_points, load_scores, save_points, save_scores
 from mbagent.analysis.accuracy.samplers import FitOptions
+from mbagent.analysis.accuracy.scores import Score
 from mbagent.analysis.accuracy.trials import TRIALS
 from mbagent.analysis.parallel import run_all
 
@@ -39,6 +40,9 @@ class Args:
     """All trials with 20 data sets each, 60 of the tiniest, 5 of the largest (about an hour and a half)."""
     trials: tuple[str, ...] | None = None
     """Which of 1a, 1b, 2a, 2b, 2c, 3; by default all but 3, with --full all."""
+    parts: tuple[Part, ...] | None = None
+    """Every sampler in every trial; the combined sampler with one thing changed at a time; growing numbers of variables.
+    By default the first, with --full all."""
     seeds: int | None = None
     """Data sets for each trial; by default 3."""
     first_seed: int = FIRST_SCORED_SEED
@@ -71,11 +75,31 @@ def settings_of(args: Args) -> Settings:
         raise ValueError(f"--seeds must be at least 1 data set, got {seeds}.")
     if args.n_draws < 1:
         raise ValueError(f"--n-draws must be at least 1, got {args.n_draws}.")
-    return Settings(trials, seeds, args.first_seed, args.n_draws, args.fit, args.relates, args.shuffle, args.multiplier)
+    parts: tuple[Part, ...] = args.parts if args.parts is not None else get_args(Part) if args.full else ("samplers",)
+    return Settings(trials, seeds, args.first_seed, args.n_draws, args.fit, args.relates, args.shuffle, args.multiplier, parts)
 
 
 def _line(outcome: Outcome) -> str:
-    return f"trial {outcome.task.trial}, data set {outcome.task.seed}"
+    return f"{outcome.task.part}, {outcome.task.trial}, data set {outcome.task.seed}"
+
+
+def _run(args: Args, settings: Settings, tasks: list[Task], console: Console) -> tuple[dict[Part, list[Score]], Points]:
+    """Does the tasks, saving after each; returns all scores that are in the folder then, by part, and the points."""
+    tables = {part: args.output / f"{'results' if part == 'samplers' else part}.csv" for part in get_args(Part)}
+    fresh = set() if args.resume or args.report_only else set(settings.parts)
+    kept = {part: [] if part in fresh else load_scores(path) for part, path in tables.items()}
+    drawn = {} if "samplers" in fresh else load_points(args.output / "points.npz")
+    done = {(part, score.trial, score.seed) for part, scores in kept.items() for score in scores}
+    todo = [task for task in tasks if (task.part, task.trial, task.seed) not in done and not args.report_only]
+    outcomes: list[Outcome] = []
+    for outcome in run_all(run_task, todo, workers=args.workers, console=console, name=_line):
+        outcomes.append(outcome)
+        part = outcome.task.part
+        save_scores(tables[part], [*kept[part], *collect(outcomes, part)])
+        if part == "samplers":
+            save_points(args.output / "points.npz", {**first_points(outcomes), **drawn})
+    scores = {part: [*kept[part], *collect(outcomes, part)] for part in kept}
+    return scores, {**first_points(outcomes), **drawn}
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -89,18 +113,10 @@ def main(argv: list[str] | None = None) -> int:
         console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
         return 1
     args.output.mkdir(parents=True, exist_ok=True)
-    table, points = args.output / "results.csv", args.output / "points.npz"
-    kept, drawn = (load_scores(table), load_points(points)) if args.resume or args.report_only else ([], {})
-    done = {(score.trial, score.seed) for score in kept}
-    todo = [task for task in tasks if (task.trial, task.seed) not in done and not args.report_only]
-    outcomes = []
-    for outcome in run_all(run_task, todo, workers=args.workers, console=console, name=_line):
-        outcomes.append(outcome)
-        save_scores(table, [*kept, *collect(outcomes)])
-        save_points(points, {**first_points(outcomes), **drawn})
+    scores, points = _run(args, settings, tasks, console)
     given = sys.argv[1:] if argv is None else argv
     command = " ".join(["python scripts/sampling_accuracy.py", *given])
-    write_page(args.output / "report.html", load_scores(table), load_points(points), settings, command)
+    write_page(args.output / "report.html", scores, points, settings, command)
     console.print(f"Wrote {args.output / 'report.html'} and {args.output / 'results.csv'}.")
     return 0
 

@@ -36,6 +36,11 @@ RESIDUAL_START = 2.0
 """Where the logit of "this factor stays as it is" starts: most variables of most worlds mostly do."""
 
 
+LARGE_GROUP = 2**15
+"""Hidden values of one group in a batch from which groups are computed one after another, each in the processor's cache:
+three times as fast as all at once then, and half as fast where groups are small."""
+
+
 class FactorCodec(nn.Module):
     """Translates factors into network inputs, and columns of network outputs into logits.
 
@@ -287,15 +292,31 @@ class Conditioner(nn.Module):
     def from_columns(self, inputs: Tensor, targets: Tensor) -> Tensor:
         """Logits [B, O, K] from columns of (s, a) [B, n_inputs] and of the next factors [B, n_columns], bits or guesses."""
         codec, n_groups = self.codec, len(self.members)
-        hidden = ACTIVATIONS[self.activation](self.groups(torch.cat((inputs, targets), dim=1)))
-        grouped = self.dropout(hidden).view(len(inputs), n_groups, self.group_size).transpose(0, 1)
-        values = (torch.bmm(grouped, self.readout) + self.offset).transpose(0, 1)
+        columns = torch.cat((inputs, targets), dim=1)
+        if len(columns) * self.group_size >= LARGE_GROUP:
+            values = self._one_by_one(columns)
+        else:
+            hidden = ACTIVATIONS[self.activation](self.groups(columns))
+            grouped = self.dropout(hidden).view(len(columns), n_groups, self.group_size).transpose(0, 1)
+            values = (torch.bmm(grouped, self.readout) + self.offset).transpose(0, 1)
         if n_groups < len(codec.outputs):
             spread = values.new_zeros(len(values), len(codec.outputs), values.shape[2])
             values = spread.index_copy(1, self.members, values)
         if codec.all_binary:
             return codec.logits(values[:, :, 0])
         return values + codec.floor
+
+    def _one_by_one(self, columns: Tensor) -> Tensor:
+        """The groups' outputs [B, g, n_values], group after group."""
+        groups, activation = self.groups, ACTIVATIONS[self.activation]
+        weights = groups.weight if groups.mask is None else groups.weight * groups.mask
+        values = [
+            self.dropout(activation(functional.linear(columns, weight, bias))) @ readout + offset
+            for weight, bias, readout, offset in zip(
+                weights.split(self.group_size), groups.bias.split(self.group_size), self.readout, self.offset, strict=True
+            )
+        ]
+        return torch.stack(values, dim=1)
 
 
 def group_mask(codec: FactorCodec, mask: Mask, group_size: int, outputs: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mbagent.models.networks import RESIDUAL_START, Affine, FactorCodec, uniform
-from mbagent.models.planes import Convolution, cells_of, maximum, logits_of
+from mbagent.models.planes import Convolution, cells_of, logits_of, maximum
 from mbagent.spaces import PlaneLayout
 
 

@@ -1,31 +1,20 @@
-"""Fits every sampler to every trial's data and measures it."""
+"""What is measured on which data: every sampler in every trial, one change at a time, and growing numbers of variables."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from mbagent.analysis.accuracy import samplers as s
-from mbagent.analysis.accuracy.data import Observations, generate
-from mbagent.analysis.accuracy.measures import (
-    Distribution,
-    align,
-    full_correlation,
-    observed_correlation,
-    total_variation,
-    union_correlation,
-    valid_mass,
-)
-from mbagent.analysis.accuracy.trials import TRIALS, find_trial
-from mbagent.models.base import TransitionModel
-
-Draws = Literal["exact", "many", "c", "c systematic"]
-"""How a distribution was found: exact probabilities, many independent draws, c independent or c systematic ones."""
+from mbagent.analysis.accuracy.data import DataOptions, generate
+from mbagent.analysis.accuracy.scores import FEW_DRAWS, Bench, Score, timed
+from mbagent.analysis.accuracy.trials import SCALING, TRIALS, Trial, find_trial
+from mbagent.analysis.accuracy.variants import VARIANTS, fit_masked
 
 FIRST_SCORED_SEED = 1000
 """Seeds from here on are scored; settings were chosen on those below."""
@@ -33,7 +22,12 @@ FIRST_SCORED_SEED = 1000
 FEW_ITERATIONS = 25
 """For the paper's remark on more training: the same networks after a tenth of the iterations."""
 
-NAN = float("nan")
+Part = Literal["samplers", "variants", "scaling"]
+"""Every sampler in every trial; the combined sampler with one thing changed at a time; growing numbers of variables."""
+
+VARIED = {"2a": 5, "2c": 5, "3": 1}
+"""Trials in which one thing at a time is changed, and on how many data sets: those where the paper reports more than
+its networks reach here."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +41,7 @@ class Settings:
         n_draws: draws for each input where they are many.
         fit: how the paper's networks are fitted.
         relates, shuffle, multiplier: see DataOptions.
+        parts: see Part.
     """
 
     trials: tuple[str, ...] = tuple(trial.name for trial in TRIALS)
@@ -57,52 +52,25 @@ class Settings:
     relates: Literal["previous", "input"] = "previous"
     shuffle: Literal["output", "input"] = "output"
     multiplier: float = 1.0
-
-
-@dataclass(frozen=True)
-class Score:
-    """One sampler on one data set.
-
-    Attributes:
-        trial, seed: which data.
-        sampler: its name.
-        draws: how its distribution was found.
-        union: Pearson over the outcomes observed or generated, the paper's; NaN where undefined.
-        seen: Pearson over the outcomes observed.
-        full: Pearson over all outcomes; NaN where they are too many to list.
-        variation: total variation, mean over inputs.
-        valid: generated mass on observed outcomes, mean over inputs.
-        log_likelihood: nats an observation, from exact probabilities; else NaN.
-        at_zero: mean probability given to the generated outcomes that were never observed.
-        at_one: mean probability given to outcomes that were always observed; NaN if there are none.
-        parameters: number of weights.
-        fit_seconds, sample_microseconds: processor time of the fit, and of one draw.
-    """
-
-    trial: str
-    seed: int
-    sampler: str
-    draws: Draws
-    union: float
-    seen: float
-    full: float
-    variation: float
-    valid: float
-    log_likelihood: float = NAN
-    at_zero: float = NAN
-    at_one: float = NAN
-    parameters: int = 0
-    fit_seconds: float = NAN
-    sample_microseconds: float = NAN
+    parts: tuple[Part, ...] = ("samplers",)
 
 
 @dataclass(frozen=True)
 class Task:
-    """One trial with one seed."""
+    """One part of one trial with one seed."""
 
     trial: str
     seed: int
     settings: Settings
+    part: Part = "samplers"
+
+    @property
+    def options(self) -> DataOptions:
+        """The data's parameters."""
+        given, options = self.settings, find_trial(self.trial).options
+        # Growing numbers of variables have a multiplier of their own, so that the largest can be fitted at all.
+        b = options.multiplier if self.part == "scaling" else given.multiplier
+        return replace(options, relates=given.relates, shuffle=given.shuffle, multiplier=b)
 
 
 @dataclass(frozen=True)
@@ -111,116 +79,72 @@ class Outcome:
 
     task: Task
     scores: list[Score]
-    points: dict[str, np.ndarray]
+    points: dict[str, NDArray[np.float64]]
 
 
 def plan(settings: Settings) -> list[Task]:
     """All tasks, the longest first."""
-    tasks = []
-    for trial in sorted(map(find_trial, settings.trials), key=lambda trial: -trial.options.d):
-        n = trial.seeds if settings.seeds is None else settings.seeds
-        tasks += [Task(trial.name, settings.first_seed + i, settings) for i in range(n)]
-    return tasks
+    tasks: list[Task] = []
+    chosen = [find_trial(name) for name in settings.trials]
+    for part in settings.parts:
+        for trial in SCALING if part == "scaling" else chosen:
+            n = min(_seeds(part, trial), settings.seeds or 10**9)
+            tasks += [Task(trial.name, settings.first_seed + i, settings, part) for i in range(n)]
+    return sorted(tasks, key=lambda task: (-task.options.d, -task.options.n_inputs))
+
+
+def _seeds(part: Part, trial: Trial) -> int:
+    return VARIED.get(trial.name, 0) if part == "variants" else trial.seeds
 
 
 def run_task(task: Task) -> Outcome:
-    """Fits and measures every sampler on one data set."""
+    """Fits and measures samplers on one data set."""
     torch.set_num_threads(1)
-    settings = task.settings
-    more = {"relates": settings.relates, "shuffle": settings.shuffle, "multiplier": settings.multiplier}
-    options = replace(find_trial(task.trial).options, **more)  # type: ignore[arg-type]  # checked at run time
-    bench = _Bench(task, generate(options, task.seed))
-    fit, seed = settings.fit, task.seed
-    (alone, combined), seconds = _timed(lambda: s.fit_paper(bench.data, fit, seed))
-    bench.many(s.PREDICTOR, alone, seconds, keep=True)
-    bench.many(s.COMBINED, combined, seconds, keep=True)
-    few = replace(fit, iterations=FEW_ITERATIONS)
-    (_, early), seconds = _timed(lambda: s.fit_paper(bench.data, few, seed))
-    bench.many(f"{s.COMBINED}, {FEW_ITERATIONS} iterations", early, seconds)
-    causal, seconds = _timed(lambda: s.fit_causal(bench.data, seed))
-    bench.every_way(s.CAUSAL, causal, seconds)
-    machine, seconds = _timed(lambda: s.fit_boltzmann(bench.data, seed))
-    bench.many(s.BOLTZMANN, machine, seconds)
-    if machine.n_outcomes <= 2 ** (s.EXHAUSTIVE + 1):
-        bench.exact(s.BOLTZMANN, machine, seconds)
-    table, seconds = _timed(lambda: s.fit_table(bench.data, prior=1.0))
-    bench.exact(s.TABLE, table, seconds)
-    perfect, seconds = _timed(lambda: s.fit_table(bench.data, prior=0.0))
-    bench.every_way(s.PERFECT, perfect, seconds)
+    n_draws = task.settings.n_draws
+    if task.part != "samplers" and task.options.d > s.EXHAUSTIVE:
+        n_draws = min(n_draws, FEW_DRAWS)
+    bench = Bench(task.trial, task.seed, generate(task.options, task.seed), n_draws)
+    {"samplers": _samplers, "variants": _variants, "scaling": _scaling}[task.part](bench, task.settings.fit)
     return Outcome(task, bench.scores, bench.points)
 
 
-class _Bench:
-    """Collects the scores of one task."""
-
-    def __init__(self, task: Task, data: Observations) -> None:
-        self.task, self.data = task, data
-        self.truth = s.observed(data)
-        self.scores: list[Score] = []
-        self.points: dict[str, np.ndarray] = {}
-
-    def exact(self, sampler: str, model: TransitionModel, seconds: float) -> None:
-        found = s.exact(model, self.data)
-        self._add(sampler, "exact", found, model, seconds, log_likelihood=s.log_likelihood(self.truth, found))
-
-    def many(self, sampler: str, model: TransitionModel, seconds: float, keep: bool = False) -> None:
-        self._drawn(sampler, "many", model, seconds, self.task.settings.n_draws)
-        if keep:
-            found = s.draw(model, self.data, self.task.settings.n_draws, self.task.seed)
-            self.points[sampler] = np.stack(align(self.truth, found), axis=1)
-
-    def every_way(self, sampler: str, model: TransitionModel, seconds: float) -> None:
-        """By exact probabilities, many draws, c draws and c systematic draws."""
-        c = self.data.outputs.shape[1]
-        self.exact(sampler, model, seconds)
-        self.many(sampler, model, seconds)
-        self._drawn(sampler, "c", model, seconds, c)
-        self._add(sampler, "c systematic", s.draw_systematically(model, self.data, c, self.task.seed), model, seconds)
-
-    def _drawn(self, sampler: str, draws: Draws, model: TransitionModel, seconds: float, n: int) -> None:
-        found, took = _timed(lambda: s.draw(model, self.data, n, self.task.seed))
-        each = took * 1e6 / (n * len(self.data.inputs))
-        self._add(sampler, draws, found, model, seconds, sample_microseconds=each)
-
-    def _add(
-        self, sampler: str, draws: Draws, found: Distribution, model: TransitionModel, seconds: float, **more: float
-    ) -> None:
-        truth, d = self.truth, self.data.d
-        p, q = align(truth, found)
-        listed = found.complete
-        self.scores.append(
-            Score(
-                trial=self.task.trial,
-                seed=self.task.seed,
-                sampler=sampler,
-                draws=draws,
-                union=union_correlation(truth, found) if draws != "exact" else NAN,
-                seen=observed_correlation(truth, found),
-                full=full_correlation(truth, found, d) if listed and d <= s.EXHAUSTIVE else NAN,
-                variation=total_variation(truth, found),
-                valid=valid_mass(truth, found),
-                at_zero=_mean(q[p == 0.0]) if listed else NAN,
-                at_one=_mean(q[p > 1.0 - 1e-9]),
-                parameters=sum(int(np.size(array)) for array in model.state_dict().values()),
-                fit_seconds=seconds,
-                **more,
-            )
-        )
+def _samplers(bench: Bench, fit: s.FitOptions) -> None:
+    data, seed = bench.data, bench.seed
+    (alone, combined), seconds = timed(lambda: s.fit_paper(data, fit, seed))
+    bench.many(s.PREDICTOR, alone, seconds, keep=True)
+    bench.many(s.COMBINED, combined, seconds, keep=True)
+    few = replace(fit, iterations=FEW_ITERATIONS)
+    (_, early), seconds = timed(lambda: s.fit_paper(data, few, seed))
+    bench.many(f"{s.COMBINED}, {FEW_ITERATIONS} iterations", early, seconds, slow=True)
+    causal, seconds = timed(lambda: s.fit_causal(data, seed))
+    bench.every_way(s.CAUSAL, causal, seconds)
+    machine, seconds = timed(lambda: s.fit_boltzmann(data, seed))
+    bench.many(s.BOLTZMANN, machine, seconds, slow=True)
+    if machine.n_outcomes <= 2 ** (s.EXHAUSTIVE + 1):
+        bench.exact(s.BOLTZMANN, machine, seconds)
+    table, seconds = timed(lambda: s.fit_table(data, prior=1.0))
+    bench.exact(s.TABLE, table, seconds)
+    perfect, seconds = timed(lambda: s.fit_table(data, prior=0.0))
+    bench.every_way(s.PERFECT, perfect, seconds)
 
 
-def _mean(values: np.ndarray) -> float:
-    return float(values.mean()) if len(values) else NAN
+def _variants(bench: Bench, fit: s.FitOptions) -> None:
+    for variant in VARIANTS:
+        found, seconds = timed(lambda variant=variant: variant.sample(bench.data, fit, bench.n_draws, bench.seed))  # type: ignore[misc]
+        bench.add(variant.name, "many", found, seconds=seconds)
 
 
-def _timed(work: Callable[[], s.T]) -> tuple[s.T, float]:
-    """What the work returns, and the processor seconds it took."""
-    start = time.process_time()
-    result = work()
-    return result, time.process_time() - start
+def _scaling(bench: Bench, fit: s.FitOptions) -> None:
+    (alone, combined), seconds = timed(lambda: s.fit_paper(bench.data, fit, bench.seed))
+    bench.many(s.PREDICTOR, alone, seconds)
+    bench.many(s.COMBINED, combined, seconds)
+    masked, seconds = timed(lambda: fit_masked(bench.data, fit, bench.seed))
+    bench.exact(s.CAUSAL, masked, seconds)
+    bench.many(s.CAUSAL, masked, seconds)
 
 
-def collect(outcomes: Sequence[Outcome]) -> list[Score]:
-    """All scores, in the order of trials and seeds."""
-    order = {trial.name: i for i, trial in enumerate(TRIALS)}
-    found = sorted(outcomes, key=lambda o: (order[o.task.trial], o.task.seed))
+def collect(outcomes: Sequence[Outcome], part: Part = "samplers") -> list[Score]:
+    """All scores of a part, in the order of trials and seeds."""
+    order = {trial.name: i for i, trial in enumerate((*TRIALS, *SCALING))}
+    found = sorted((o for o in outcomes if o.task.part == part), key=lambda o: (order[o.task.trial], o.task.seed))
     return [score for outcome in found for score in outcome.scores]

@@ -11,7 +11,8 @@ from typing import TypeAlias, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.analysis.accuracy.experiment import Outcome, Score
+from mbagent.analysis.accuracy.experiment import Outcome
+from mbagent.analysis.accuracy.scores import Score
 
 Points: TypeAlias = dict[tuple[str, str], NDArray[np.float64]]
 """(trial, sampler) -> pairs (observed, inferred) [M, 2] of one data set."""

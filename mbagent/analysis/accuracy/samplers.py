@@ -45,6 +45,7 @@ class FitOptions:
         sweeps: passes over all variables for one sample; the paper says "repeat".
         real_guess: start from the predictor's probabilities, as step 2 reads, rather than from bits drawn from them.
         rounding: "2d^2+1" hidden nodes in d groups: "down" is 2d a group, "up" 2d + 1.
+        widening: as many times the paper's hidden nodes.
     """
 
     iterations: int = 250
@@ -56,6 +57,7 @@ class FitOptions:
     sweeps: int = 5
     real_guess: bool = False
     rounding: Literal["down", "up"] = "down"
+    widening: int = 1
 
 
 def paper_config(d: int, n: int, options: FitOptions) -> NeuralConfig:
@@ -74,8 +76,10 @@ def paper_config(d: int, n: int, options: FitOptions) -> NeuralConfig:
         validation=0.0,
         patience=10**9,
     )
-    size = config.group_size + (options.rounding == "up")
-    return replace(config, group_size=size, sweeps=options.sweeps, real_guess=options.real_guess, training=training)
+    size = (config.group_size + (options.rounding == "up")) * options.widening
+    hidden = (config.hidden[0] * options.widening,)
+    shape = replace(config, hidden=hidden, group_size=size, training=training)
+    return replace(shape, sweeps=options.sweeps, real_guess=options.real_guess)
 
 
 def causal_config(d: int) -> NeuralConfig:

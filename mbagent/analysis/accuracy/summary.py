@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from mbagent.analysis.accuracy.experiment import FEW_ITERATIONS, Draws, Score
+from mbagent.analysis.accuracy.experiment import FEW_ITERATIONS
 from mbagent.analysis.accuracy.samplers import COMBINED, PREDICTOR
+from mbagent.analysis.accuracy.scores import Draws, Score
 from mbagent.analysis.accuracy.trials import TRIALS, Trial
 from mbagent.analysis.statistics import Interval
 
@@ -96,6 +97,27 @@ def table(scores: Sequence[Score], trial: Trial) -> list[Line]:
             )
         )
     return lines
+
+
+@dataclass(frozen=True)
+class VariantLine:
+    """One thing changed: correlation and total variation in each trial, by its name."""
+
+    name: str
+    union: dict[str, Cell]
+    variation: dict[str, Cell]
+
+
+def variant_table(scores: Sequence[Score]) -> list[VariantLine]:
+    """The lines of the table in which one thing at a time is changed."""
+    trials = list(dict.fromkeys(score.trial for score in scores))
+
+    def cells(name: str, field: str) -> dict[str, Cell]:
+        chosen = [score for score in scores if score.sampler == name]
+        return {trial: mean_interval(getattr(s, field) for s in chosen if s.trial == trial) for trial in trials}
+
+    names = dict.fromkeys(score.sampler for score in scores)
+    return [VariantLine(name, cells(name, "union"), cells(name, "variation")) for name in names]
 
 
 def paper_parameters(d: int) -> tuple[int, int]:

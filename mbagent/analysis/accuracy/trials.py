@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from mbagent.analysis.accuracy.data import DataOptions
 
+NAN = float("nan")
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -42,13 +44,21 @@ TRIALS: tuple[Trial, ...] = (
 )
 
 
+SCALING: tuple[Trial, ...] = (
+    *(Trial(f"d = {d}", DataOptions(d, 5), NAN, NAN, seeds=3) for d in (2, 4, 8, 16)),
+    Trial("d = 32", DataOptions(32, 5), NAN, NAN, seeds=1),
+    Trial("d = 64", DataOptions(64, 5, multiplier=0.25), NAN, NAN, seeds=1),
+)
+"""Growing numbers of variables; the last has as many inputs as the one before, so that it can be fitted in minutes."""
+
+
 def find_trial(name: str) -> Trial:
-    """The trial called ``name``.
+    """The trial called ``name``, one of the paper's or of those with growing numbers of variables.
 
     Raises:
         ValueError: there is none; the message lists those there are.
     """
-    for trial in TRIALS:
+    for trial in (*TRIALS, *SCALING):
         if trial.name == name:
             return trial
     raise ValueError(f"There is no trial {name!r}; choose from {', '.join(trial.name for trial in TRIALS)}.")

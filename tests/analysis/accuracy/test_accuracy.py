@@ -8,11 +8,12 @@ import pytest
 
 from mbagent.analysis.accuracy import experiment, samplers
 from mbagent.analysis.accuracy.data import DataOptions, generate
-from mbagent.analysis.accuracy.experiment import Outcome, Score, Settings, plan, run_task
+from mbagent.analysis.accuracy.experiment import Outcome, Part, Settings, plan, run_task
 from mbagent.analysis.accuracy.measures import total_variation, valid_mass
 from mbagent.analysis.accuracy.page import write_page
 from mbagent.analysis.accuracy.results import first_points, load_points, load_scores, save_points, save_scores
 from mbagent.analysis.accuracy.samplers import COMBINED, PREDICTOR, FitOptions
+from mbagent.analysis.accuracy.scores import Score
 from mbagent.analysis.accuracy.summary import mean_interval, paper_parameters, statements
 from mbagent.analysis.accuracy.trials import find_trial
 from mbagent.models.boltzmann import BoltzmannConfig
@@ -115,7 +116,10 @@ def test_a_whole_run_becomes_one_page_and_one_table(tmp_path: Path) -> None:
     again, points_again = load_scores(tmp_path / "results.csv"), load_points(tmp_path / "points.npz")
     assert [repr(score) for score in again] == [repr(score) for score in scores]  # NaN equals itself here
     assert points_again.keys() == points.keys()
-    write_page(tmp_path / "report.html", again, points_again, settings, "python scripts/sampling_accuracy.py")
+    changed = [replace(score("2a", name, 0.8), trial=t) for name in ("as scored", "one sweep") for t in ("2a", "3")]
+    growing = [score(trial, COMBINED, 0.8, parameters=9, sample_microseconds=1.0) for trial in ("d = 2", "d = 4")]
+    parts: dict[Part, list[Score]] = {"samplers": again, "variants": changed, "scaling": growing}
+    write_page(tmp_path / "report.html", parts, points_again, settings, "python scripts/sampling_accuracy.py")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "Trial 1a: d = 2, low correlation, c = 4, 4 inputs" in page
     assert "http" not in page
