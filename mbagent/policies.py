@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from mbagent.learned_reward import LearnedReward
 from mbagent.models.base import States, TransitionModel
-from mbagent.planning.flat_monte_carlo import FlatMonteCarlo
+from mbagent.planning.flat_monte_carlo import FlatMonteCarlo, direct_model
 from mbagent.planning.goal import Goal
 from mbagent.planning.machine_planner import MachinePlanner
 from mbagent.planning.mcts import MctsPlanner
@@ -41,6 +41,9 @@ class PlannerPolicy(BasePolicy):
         model: the transition model.
         reward_model: the learned reward.
         settings: see PlannerSettings.
+
+    Raises:
+        ValueError: forecasts="direct" with another planner, or with a model that has none.
     """
 
     planner_class: ClassVar[type[Planner]] = MctsPlanner
@@ -61,6 +64,10 @@ class PlannerPolicy(BasePolicy):
         self.factored = FactoredSpace(observation_space)
         self.actions = ActionEnumeration(action_space)
         self.transition_model, self.reward_model, self.settings = model, reward_model, settings
+        if settings.forecasts == "direct":
+            if self.planner_class is not FlatMonteCarlo:
+                raise ValueError("forecasts='direct' is for the FlatMonteCarloPolicy; other planners go step by step.")
+            direct_model(model)
         self.planner: Planner = self.planner_class(settings)
         self.start_states: States = np.zeros((0, len(self.factored)), dtype=np.int64)
         self.goal: Goal | None = None

@@ -204,12 +204,17 @@ class BaseTransitionModel(ABC):
             states: int64 [B, F].
             actions: int64 [B].
             of: function of next states [N, F] to floats [N, ...]; None for the factors themselves.
-            n_samples: draws for each row.
+            n_samples: draws for each row, at least 2.
             seed: which random numbers.
+
+        Raises:
+            ValueError: fewer draws, which have no variance.
 
         Returns:
             (mean [B, ...], variance [B, ...]), the unbiased sample moments.
         """
+        if n_samples < 2:
+            raise ValueError(f"Moments need at least 2 draws a row to have a variance, got n_samples={n_samples}.")
         rows = np.repeat(np.arange(len(states)), n_samples)
         keys = derive(seed, np.arange(len(rows)))
         next_states, _ = self.sample(states[rows], actions[rows], keys)

@@ -23,6 +23,9 @@ PLANE_TRAINING = TrainingConfig(batch_size=128, weight_decay=1e-3, epochs=40.0, 
 of a model, so training goes on for long."""
 
 
+STRING_STEPS = 2500
+"""Most gradient steps for strings of actions on planes: one costs as many layers as there are actions."""
+
 DIRECT_STEPS = tuple(range(2, 16))
 """Numbers of steps that the model "direct" learns a network of its own for."""
 
@@ -48,7 +51,8 @@ def build_string(space: FactoredSpace, n_actions: int, learning_rate: float, n_s
     if planes is None:
         config = NeuralConfig(training=replace(TrainingConfig(), learning_rate=learning_rate))
         return NeuralTransitionModel(cards, n_actions, config, n_steps=n_steps)
-    config = NeuralConfig(conditioner=None, training=replace(PLANE_TRAINING, learning_rate=learning_rate))
+    training = replace(PLANE_TRAINING, learning_rate=learning_rate, max_steps=STRING_STEPS)
+    config = NeuralConfig(conditioner=None, training=training)
     return NeuralTransitionModel(
         cards,
         n_actions,

@@ -164,13 +164,14 @@ class DirectForecastModel(BaseTransitionModel):
             return None if progress is None else lambda done: progress(share * (i + done))
 
         report = self.one_step.fit(data, seed=seed, progress=part(0))
+        log = {**report.log, "seconds_1_steps": report.seconds}
         self._known = set()
         for i, (n, model) in enumerate(self.direct.items(), start=1):
             apart = steps_apart(data, n, seed)
             if len(apart):
-                model.fit(apart, seed=seed, progress=part(i))
+                log[f"seconds_{n}_steps"] = model.fit(apart, seed=seed, progress=part(i)).seconds
                 self._known.add(n)
-        return replace(report, seconds=time.perf_counter() - began)
+        return replace(report, seconds=time.perf_counter() - began, log=log)
 
     def forecast(self, states: States, strings: Actions, rng: Randomness) -> tuple[States, Bools]:
         """A draw of where each string of actions leads, int64 [B, n], n >= 0.

@@ -313,7 +313,11 @@ class Conditioner(nn.Module):
         values = [
             self.dropout(activation(functional.linear(columns, weight, bias))) @ readout + offset
             for weight, bias, readout, offset in zip(
-                weights.split(self.group_size), groups.bias.split(self.group_size), self.readout, self.offset, strict=True
+                torch.split(weights, self.group_size),
+                torch.split(groups.bias, self.group_size),
+                self.readout,
+                self.offset,
+                strict=True,
             )
         ]
         return torch.stack(values, dim=1)

@@ -21,7 +21,8 @@ class ReachableMDP:
         next_states: int64 [M], indices of states.
         probabilities: float64 [M].
         terminated: bool [M].
-        complete: whether every reachable state was expanded within the budget.
+        complete: whether every reachable state was expanded within the budget. If not, the machine is partial: states
+            that were met but not expanded have no successors.
     """
 
     states: States
@@ -64,7 +65,16 @@ def grow_reachable(
 def reachable_mdp(
     model: TransitionModel, start: States, max_states: int = 10_000, n_samples: int = 32, seed: int = 0
 ) -> ReachableMDP:
-    """The machine reachable from ``start`` int64 [B, F], as plain arrays; see ``grow_reachable`` for the arguments."""
+    """The machine reachable from ``start`` int64 [B, F], as plain arrays; see ``grow_reachable`` for the arguments.
+
+    Where more than ``max_states`` states can be reached, the nearest ones are expanded and ``complete`` is False.
+
+    Raises:
+        ValueError: a budget of no states or no draws, or no start state.
+    """
+    for name, value in (("max_states", max_states), ("n_samples", n_samples), ("the number of start states", len(start))):
+        if value < 1:
+            raise ValueError(f"A machine needs at least one of each, but {name} is {value}; give 1 or more.")
     graph, complete = grow_reachable(model, start, max_states, n_samples, seed)
     order = np.lexsort((graph.actions, graph.sources))
     counts = graph.counts

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from mbagent.models.base import States, TransitionModel
+from mbagent.models.forecasts import DirectForecastModel
 from mbagent.planning.goal import Goal
 from mbagent.planning.planner import Plan, PlannerSettings, best_actions
-from mbagent.planning.rollouts import random_returns
+from mbagent.planning.rollouts import forecast_returns, random_returns
 from mbagent_envs.random_keys import derive
 
 
@@ -47,7 +48,25 @@ class FlatMonteCarlo:
         # Simulation k meets the same luck under every action.
         luck = derive(settings.seed, np.arange(each))
         keys = np.tile(luck, len(roots) * n_actions)
-        returns = random_returns(model, goal, roots[rows], keys, settings.horizon, settings.gamma, actions)
+        given = (goal, roots[rows], keys, settings.horizon, settings.gamma, actions)
+        if settings.forecasts == "direct":
+            returns = forecast_returns(direct_model(model), *given)
+        else:
+            returns = random_returns(model, *given)
         returns = returns.reshape(shape)
         values = returns.mean(axis=2) if settings.choice == "mean" else returns.max(axis=2)
         return Plan(best_actions(values), values, np.full(shape[:2], float(each)))
+
+
+def direct_model(model: TransitionModel) -> DirectForecastModel:
+    """The model, if it forecasts several steps directly.
+
+    Raises:
+        ValueError: it does not.
+    """
+    if not isinstance(model, DirectForecastModel):
+        raise ValueError(
+            f"forecasts='direct' needs a model with forecasts of several steps, not a {type(model).__name__}; "
+            "give the agent model='direct'."
+        )
+    return model

@@ -27,6 +27,8 @@ class PlannerSettings:
         leaf_values: "machine" (values of the reachable machine) or "rollouts" (random play).
         backup: "max" (an action is worth what the best behaviour after it is worth) or "mean" (plain UCT).
         choice: "mean", or "greatest" as in the paper (flat Monte Carlo only; it seeks risk).
+        forecasts: "iterated" (simulations go step by step) or "direct" (flat Monte Carlo only: each step is forecast from
+            the root by a model of its own, paper 4.2; needs ``model="direct"`` or another DirectForecastModel).
         c_uct: weight of the search's exploration, in units of the range of values seen.
         wave: simulations between two calls of the model.
         prior_visits: how many visits a value from the machine counts for in the search.
@@ -46,6 +48,7 @@ class PlannerSettings:
     leaf_values: Literal["machine", "rollouts"] = "machine"
     backup: Literal["max", "mean"] = "max"
     choice: Literal["mean", "greatest"] = "mean"
+    forecasts: Literal["iterated", "direct"] = "iterated"
     c_uct: float = 0.5
     wave: int = 16
     prior_visits: float = 8.0
@@ -77,6 +80,7 @@ class PlannerSettings:
             "leaf_values": ("machine", "rollouts"),
             "backup": ("max", "mean"),
             "choice": ("mean", "greatest"),
+            "forecasts": ("iterated", "direct"),
         }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:

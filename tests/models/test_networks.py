@@ -111,3 +111,15 @@ def test_dropout_zeroes_its_share_keeps_the_mean_and_rests_without_a_generator()
         assert (dropped == 0).float().mean(dim=axis).std() == pytest.approx(np.sqrt(0.24 / 200), rel=0.2)
     by_byte = (dropped.flatten()[: 200 * 200].view(-1, 8) == 0).float().mean(dim=0)
     assert (by_byte - 0.4).abs().max() < 0.03
+
+
+@pytest.mark.parametrize("cardinalities", CARDINALITIES)
+def test_large_groups_computed_one_after_another_are_the_same(
+    cardinalities: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    codec = FactorCodec(cardinalities, 2)
+    conditioner = Conditioner(codec, "others", 5, correction=False, generator=generator())
+    given = rows(codec)
+    together = conditioner(*given)
+    monkeypatch.setattr("mbagent.models.networks.LARGE_GROUP", 1)
+    torch.testing.assert_close(conditioner(*given), together)

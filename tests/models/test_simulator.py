@@ -66,3 +66,24 @@ def test_there_is_nothing_to_learn_and_nothing_to_save() -> None:
         model.load_state_dict({"x": np.zeros(1)})
     none = model.successors(np.zeros((0, 15), dtype=np.int64), np.zeros(0, dtype=np.int64), 8, 0)
     assert none.offsets.tolist() == [0]
+
+
+def test_moments_of_the_true_geyser_runner_are_exact_within_sampling_error() -> None:
+    model, n_samples = SimulatorModel(GeyserRunner()), 4000
+    states = np.repeat(model.reachable_mdp(model.start_states(64)).states, 3, axis=0)
+    actions = np.tile(np.arange(3), 50)
+    mean, variance = model.moments(states, actions, n_samples=n_samples)
+    p = model.marginals(states, actions)[:, 1::2]  # exact probability that each bit is 1
+    assert abs(mean - p).max() < 6 * np.sqrt(0.25 / n_samples)
+    assert abs(variance - p * (1 - p)).max() < 6 * np.sqrt(0.25 / n_samples)
+    # Of a function: the place of the next eruption, uniform over five columns.
+    mean, variance = model.moments(states, actions, of=lambda s: s[:, 10:].argmax(axis=1).astype(np.float64), n_samples=n_samples)
+    assert mean.shape == (150,)
+    assert abs(mean - 2.0).max() < 6 * np.sqrt(2.0 / n_samples)
+    assert abs(variance - 2.0).max() < 0.25
+
+
+def test_a_single_draw_has_no_moments() -> None:
+    model = SimulatorModel(GeyserRunner())
+    with pytest.raises(ValueError, match="at least 2 draws"):
+        model.moments(model.start_states(2), np.zeros(2, dtype=np.int64), n_samples=1)

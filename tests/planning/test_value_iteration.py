@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from mbagent.models import SimulatorModel
-from mbagent.models.reachable import grow_reachable
+from mbagent.models.reachable import ReachableMDP, grow_reachable
 from mbagent.models.state_graph import StateGraph
 from mbagent.planning.lookahead import grow_lookahead
 from mbagent.planning.machine_planner import MachinePlanner
@@ -87,6 +87,62 @@ def test_the_machine_of_the_true_geyser_runner_is_exact() -> None:
         part = slice(mdp.offsets[state, action], mdp.offsets[state, action + 1])
         assert set(position[mdp.next_states[part]]) == {int(np.clip(position[state] + action - 1, 0, 9))}
         assert len(set(mdp.next_states[part])) == 5
+
+
+class SampledGame(SimulatorModel):
+    """A true model that does not list its successors: the machine has to be built from draws."""
+
+    def __init__(self, game: GeyserRunner) -> None:
+        super().__init__(game)
+        self._lists = False
+
+
+def values_of(mdp: ReachableMDP, game: GeyserRunner, gamma: float) -> dict[bytes, float]:
+    """Optimal values by plain value iteration on the arrays, by state."""
+    n, n_actions = len(mdp.states), mdp.offsets.shape[1] - 1
+    table, rewards = np.zeros((n, n_actions, n)), np.zeros((n, n_actions, n))
+    for state, action in np.ndindex(n, n_actions):
+        part = slice(mdp.offsets[state, action], mdp.offsets[state, action + 1])
+        table[state, action, mdp.next_states[part]] = mdp.probabilities[part]
+        obs = mdp.states.astype(np.int8)
+        rewards[state, action] = game.reward(np.repeat(obs[state : state + 1], n, axis=0), np.full(n, action), obs)
+    v = np.zeros(n)
+    for _ in range(1500):
+        v = (table * (rewards + gamma * v)).sum(axis=2).max(axis=1)
+    return {state.tobytes(): value for state, value in zip(mdp.states, v, strict=True)}
+
+
+@pytest.mark.parametrize("hit_cost", [1.0, 5.0])
+def test_the_machine_drawn_from_the_geyser_runner_is_right_within_sampling_error(hit_cost: float) -> None:
+    game, n_samples = GeyserRunner(hit_cost=hit_cost), 10_000
+    listed, drawn = SimulatorModel(game), SampledGame(game)
+    exact = listed.reachable_mdp(listed.start_states(64))
+    sampled = drawn.reachable_mdp(drawn.start_states(64), n_samples=n_samples)
+    assert sampled.complete
+    assert len(sampled.probabilities) == len(exact.probabilities) == 50 * 3 * 5
+    # Five standard deviations of a frequency at p = 0.2.
+    assert abs(sampled.probabilities - 0.2).max() < 5 * np.sqrt(0.2 * 0.8 / n_samples)
+    truth, found = values_of(exact, game, 0.99), values_of(sampled, game, 0.99)
+    assert truth.keys() == found.keys()
+    assert max(abs(found[state] - value) / abs(value) for state, value in truth.items()) < 0.01
+
+
+def test_a_machine_too_large_for_its_budget_is_partial_and_says_so() -> None:
+    model = SimulatorModel(GeyserRunner())
+    mdp = model.reachable_mdp(model.start_states(64), max_states=20)
+    assert not mdp.complete
+    expanded = np.diff(mdp.offsets, axis=1).sum(axis=1) > 0
+    assert expanded.sum() == 20
+    assert 20 < len(mdp.states) <= 50
+    totals = np.add.reduceat(mdp.probabilities, mdp.offsets[expanded, :-1].ravel())
+    np.testing.assert_allclose(totals, 1.0)
+
+
+@pytest.mark.parametrize(("budget", "told"), [({"max_states": 0}, "max_states is 0"), ({"n_samples": 0}, "n_samples is 0")])
+def test_a_machine_of_nothing_is_refused(budget: dict[str, int], told: str) -> None:
+    model = SimulatorModel(GeyserRunner())
+    with pytest.raises(ValueError, match=told):
+        model.reachable_mdp(model.start_states(4), **budget)
 
 
 def many_corridors(n_corridors: int, length: int) -> tuple[TableWorld, np.ndarray]:

@@ -1,0 +1,103 @@
+"""Compares forecasts of 1 ... n steps: the one-step model iterated, and a model of its own for each n (paper 4.2).
+
+python scripts/forecast.py                # quick: n = 1, 2, 4, 8, 15, one seed, 5,000 steps of experience
+python scripts/forecast.py --full         # n = 1 ... 15, 3 seeds, 20,000 steps, and returns of a planner with either kind
+
+"""
+
+from __future__ import annotations
+
+import os
+
+# Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+
+from mbagent.analysis.forecasts.experiment import CASES, Outcome, Return, Score, Settings, plan, run_task, save_csv
+from mbagent.analysis.forecasts.page import write_page
+from mbagent.analysis.parallel import run_all
+
+QUICK_STEPS, FULL_STEPS = (1, 2, 4, 8, 15), tuple(range(1, 16))
+
+
+@dataclass(frozen=True)
+class Args:
+    """Compare forecasts some steps ahead."""
+
+    full: bool = False
+    """Every n from 1 to 15, 3 seeds, 20,000 steps of experience, and the returns of a planner (about an hour)."""
+    games: tuple[str, ...] = tuple(case.name for case in CASES)
+    """Which games."""
+    steps: tuple[int, ...] | None = None
+    """Numbers of steps to forecast; by default 1 2 4 8 15, with --full 1 to 15."""
+    timesteps: int | None = None
+    """Steps of random play to learn from; by default 5,000, with --full 20,000."""
+    seeds: int | None = None
+    """Repetitions; by default 1, with --full 3."""
+    first_seed: int = Settings.first_seed
+    """Seed of the first."""
+    n_starts: int = Settings.n_starts
+    """States to forecast from."""
+    n_draws: int = Settings.n_draws
+    """Draws for each."""
+    episodes: int | None = None
+    """Episodes that flat Monte Carlo plays with either kind of forecasts; by default 0, with --full 3."""
+    output: Path = Path("results/forecast")
+    """Folder for the page, the figure and the tables."""
+    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
+    """Number of processes, each with one thread."""
+
+
+def settings_of(args: Args) -> Settings:
+    """The settings that the options stand for."""
+
+    def chosen(given: int | None, quick: int, full: int) -> int:
+        return given if given is not None else full if args.full else quick
+
+    steps = args.steps if args.steps is not None else FULL_STEPS if args.full else QUICK_STEPS
+    return Settings(
+        cases=args.games,
+        steps=tuple(sorted(set(steps))),
+        timesteps=chosen(args.timesteps, 5000, 20_000),
+        seeds=chosen(args.seeds, 1, 3),
+        first_seed=args.first_seed,
+        n_starts=args.n_starts,
+        n_draws=args.n_draws,
+        episodes=chosen(args.episodes, 0, 3),
+    )
+
+
+def _line(outcome: Outcome) -> str:
+    return f"{outcome.task.case.name}, seed {outcome.task.seed}"
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command line and returns its exit code."""
+    args = tyro.cli(Args, args=argv, description=__doc__.splitlines()[0])
+    console = Console()
+    try:
+        settings = settings_of(args)
+    except ValueError as error:
+        console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
+        return 1
+    args.output.mkdir(parents=True, exist_ok=True)
+    outcomes: list[Outcome] = []
+    command = " ".join(["python scripts/forecast.py", *(sys.argv[1:] if argv is None else argv)])
+    for outcome in run_all(run_task, plan(settings), workers=args.workers, console=console, name=_line):
+        outcomes.append(outcome)
+        save_csv(args.output / "results.csv", [score for o in outcomes for score in o.scores], Score)
+        save_csv(args.output / "returns.csv", [value for o in outcomes for value in o.returns], Return)
+    figure = write_page(args.output / "report.html", outcomes, settings, command)
+    (args.output / "forecast.png").write_bytes(figure)
+    console.print(f"Wrote report.html, forecast.png and results.csv to {args.output}.")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
