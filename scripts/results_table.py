@@ -1,6 +1,6 @@
-"""Writes the table of results that the README shows, from the results.csv of a comparison.
+"""Writes the tables of results that the README shows, from the results.csv of a comparison and of the sampling accuracy.
 
-python scripts/results_table.py --results results/compare/results.csv
+python scripts/results_table.py --results results/compare/results.csv --accuracy results/sampling_accuracy/results.csv
 """
 
 from __future__ import annotations
@@ -14,7 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
+from rich.console import Console
 
+from mbagent.analysis.accuracy.results import load_scores
+from mbagent.analysis.accuracy.summary import markdown_table
 from mbagent.analysis.cases import CASES
 from mbagent.analysis.records import AGENT, LEARNED_REWARD, TRUE_MODEL
 from mbagent.analysis.statistics import interquartile_mean
@@ -25,14 +28,16 @@ BASELINES = ("PPO", "DQN", "A2C")
 
 @dataclass(frozen=True)
 class Args:
-    """Write the README's table of results."""
+    """Write the README's tables of results; a table whose file does not exist stays as it is."""
 
     results: Path = Path("results/compare/results.csv")
     """What a comparison wrote."""
+    accuracy: Path = Path("results/sampling_accuracy/results.csv")
+    """What scripts/sampling_accuracy.py wrote."""
     baselines: Path | None = None
     """Where the baselines' rows are, if in another file."""
     readme: Path = Path("README.md")
-    """The table goes between the two marks <!-- results --> in this file."""
+    """The tables go between the marks <!-- results --> and <!-- accuracy --> in this file."""
 
 
 Scores = dict[tuple[str, str, str], list[float]]
@@ -75,13 +80,19 @@ def table(scores: Scores, others: Scores) -> str:
 
 
 def main(args: Args) -> None:
-    """Writes the table into the README."""
-    scores = read(args.results)
-    others = read(args.baselines) if args.baselines else scores
-    mark = "<!-- results -->"
+    """Writes the tables into the README."""
+    tables = {}
+    if args.results.exists():
+        scores = read(args.results)
+        tables["results"] = table(scores, read(args.baselines) if args.baselines else scores)
+    if args.accuracy.exists():
+        tables["accuracy"] = markdown_table(load_scores(args.accuracy))
     text = args.readme.read_text(encoding="utf-8")
-    filled = re.sub(f"{mark}.*{mark}", f"{mark}\n{table(scores, others)}\n{mark}", text, flags=re.DOTALL)
-    args.readme.write_text(filled, encoding="utf-8")
+    for name, filled in tables.items():
+        mark = f"<!-- {name} -->"
+        text = re.sub(f"{mark}.*{mark}", f"{mark}\n{filled}\n{mark}", text, flags=re.DOTALL)
+    args.readme.write_text(text, encoding="utf-8")
+    Console().print(f"Wrote {' and '.join(tables) or 'nothing: neither file exists'} to {args.readme}.")
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ PLANE_TRAINING = TrainingConfig(batch_size=128, weight_decay=1e-3, epochs=40.0, 
 of a model, so training goes on for long."""
 
 
-STRING_STEPS = 2500
+STRING_STEPS = 2000
 """Most gradient steps for strings of actions on planes: one costs as many layers as there are actions."""
 
 DIRECT_STEPS = tuple(range(2, 16))

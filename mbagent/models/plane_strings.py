@@ -25,7 +25,7 @@ class PlaneStringPredictor(nn.Module):
         generator: source of the first weights.
     """
 
-    def __init__(self, codec: FactorCodec, layout: PlaneLayout, channels: int = 24, *, generator: torch.Generator) -> None:
+    def __init__(self, codec: FactorCodec, layout: PlaneLayout, channels: int = 16, *, generator: torch.Generator) -> None:
         """See the class."""
         super().__init__()
         self.codec, self.layout = codec, layout

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from mbagent.analysis.accuracy.experiment import Part, Settings
 from mbagent.analysis.accuracy.results import Points
 from mbagent.analysis.accuracy.samplers import CAUSAL, COMBINED, PREDICTOR
-from mbagent.analysis.accuracy.scores import Draws, Score
+from mbagent.analysis.accuracy.scores import FEW_DRAWS, Draws, Score
 from mbagent.analysis.accuracy.summary import MEASURES, Line, mean_interval, paper_parameters, statements, table, variant_table
 from mbagent.analysis.accuracy.trials import SCALING, TRIALS, Trial, find_trial
 from mbagent.analysis.pages import FIGURE_STYLE, render, to_png
@@ -45,6 +45,7 @@ def write_page(path: Path, scores: Mapping[Part, Sequence[Score]], points: Point
         seeds=lambda part, name: len({s.seed for s in scores[part] if s.trial == name}),
         weights={trial.name: paper_parameters(trial.options.d) for trial, _ in tables},
         measures=MEASURES,
+        few_draws=FEW_DRAWS,
         draws=_DRAWS,
         settings=settings,
         command=command,

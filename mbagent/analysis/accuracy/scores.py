@@ -28,7 +28,7 @@ Draws = Literal["exact", "many", "c", "c systematic"]
 
 NAN = float("nan")
 
-FEW_DRAWS = 200
+FEW_DRAWS = 100
 """Draws for each input of slow samplers, of variants and of growing numbers of variables beyond ``samplers.EXHAUSTIVE``."""
 
 

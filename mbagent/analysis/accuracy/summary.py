@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from mbagent.analysis.accuracy.experiment import FEW_ITERATIONS
-from mbagent.analysis.accuracy.samplers import COMBINED, PREDICTOR
+from mbagent.analysis.accuracy.samplers import CAUSAL, COMBINED, PREDICTOR
 from mbagent.analysis.accuracy.scores import Draws, Score
 from mbagent.analysis.accuracy.trials import TRIALS, Trial
 from mbagent.analysis.statistics import Interval
@@ -97,6 +97,30 @@ def table(scores: Sequence[Score], trial: Trial) -> list[Line]:
             )
         )
     return lines
+
+
+def markdown_table(scores: Sequence[Score]) -> str:
+    """The main figures as Markdown, a line for each trial."""
+
+    def mean(trial: Trial, sampler: str, draws: Draws, field: str, digits: int = 2) -> str:
+        chosen = [s for s in scores if (s.trial, s.sampler, s.draws) == (trial.name, sampler, draws)]
+        estimate = mean_interval(getattr(s, field) for s in chosen).interval.estimate
+        return "–" if np.isnan(estimate) else f"{estimate:.{digits}f}"
+
+    names = ("predictor, paper", "here", "combined, paper", "here", "causal: Pearson", "total variation", "valid mass")
+    lines = ["| trial | " + " | ".join(names) + " |", "| --- |" + " ---: |" * len(names)]
+    for trial in TRIALS:
+        cells = [
+            f"{trial.paper_predictor:.2f}",
+            mean(trial, PREDICTOR, "many", "union"),
+            f"{trial.paper_combined:.2f}",
+            mean(trial, COMBINED, "many", "union"),
+            mean(trial, CAUSAL, "exact", "full", 4),
+            mean(trial, CAUSAL, "exact", "variation", 4),
+            mean(trial, CAUSAL, "exact", "valid", 4),
+        ]
+        lines.append(f"| {trial.name} (d = {trial.options.d}, c = {trial.options.c}) | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
 @dataclass(frozen=True)

@@ -85,8 +85,13 @@ VARIANTS: tuple[Variant, ...] = (
     Variant("twice the hidden nodes", _changed(lambda o: replace(o, widening=2))),
     Variant("one sweep", _changed(lambda o: replace(o, sweeps=1))),
     Variant("four times the sweeps", _changed(lambda o: replace(o, sweeps=4 * o.sweeps))),
+    Variant("twenty times the sweeps", _changed(lambda o: replace(o, sweeps=20 * o.sweeps))),
     Variant("first guess of real values", _changed(lambda o: replace(o, real_guess=True))),
     Variant("squared error", _changed(lambda o: replace(o, loss="squared"))),
+    Variant(
+        "twice the nodes, four times the iterations, twenty times the sweeps",
+        _changed(lambda o: replace(o, widening=2, iterations=4 * o.iterations, sweeps=20 * o.sweeps)),
+    ),
     Variant("perfect networks, same procedure", draw_exact_sweeps),
     Variant("causal mask, same size and training", _causal),
 )
