@@ -7,10 +7,12 @@ over its episodes.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import stats
 
 Floats = NDArray[np.float64]
 
@@ -28,6 +30,18 @@ class Interval:
     estimate: float
     low: float
     high: float
+
+
+def mean_interval(values: Iterable[float]) -> Interval:
+    """Mean with its 95% t interval; NaN values are left out, and nothing else makes it NaN."""
+    given = np.asarray(list(values), dtype=np.float64)
+    known = given[~np.isnan(given)]
+    if len(known) == 0:
+        return Interval(np.nan, np.nan, np.nan)
+    mean, half = float(known.mean()), 0.0
+    if len(known) > 1:
+        half = float(stats.t.ppf(0.975, len(known) - 1) * known.std(ddof=1) / np.sqrt(len(known)))
+    return Interval(mean, mean - half, mean + half)
 
 
 def normalised(returns: ArrayLike, random: float, reference: float) -> Floats:

@@ -13,9 +13,10 @@ from mbagent.analysis.accuracy.experiment import Part, Settings
 from mbagent.analysis.accuracy.results import Points
 from mbagent.analysis.accuracy.samplers import CAUSAL, COMBINED, PREDICTOR
 from mbagent.analysis.accuracy.scores import FEW_DRAWS, Draws, Score
-from mbagent.analysis.accuracy.summary import MEASURES, Line, mean_interval, paper_parameters, statements, table, variant_table
+from mbagent.analysis.accuracy.summary import MEASURES, Line, paper_parameters, statements, table, variant_table
 from mbagent.analysis.accuracy.trials import SCALING, TRIALS, Trial, find_trial
 from mbagent.analysis.pages import FIGURE_STYLE, render, to_png
+from mbagent.analysis.statistics import mean_interval
 
 _DRAWS: dict[Draws, str] = {"exact": "exact", "many": "independent", "c": "c", "c systematic": "c systematic"}
 
@@ -106,7 +107,7 @@ def draw_scaling(scores: Sequence[Score]) -> bytes:
 
             def mean(trial: Trial, field: str, draws: Draws, sampler: str = sampler) -> float:
                 chosen = (s for s in scores if (s.trial, s.sampler, s.draws) == (trial.name, sampler, draws))
-                return mean_interval(getattr(s, field) for s in chosen).interval.estimate
+                return mean_interval(getattr(s, field) for s in chosen).estimate
 
             style = {"marker": marker, "color": colour, "label": sampler, "markersize": 5}
             error.plot(sizes, [mean(trial, "variation", draws) for trial in trials], **style)

@@ -6,13 +6,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from mbagent.analysis.accuracy.experiment import FEW_ITERATIONS
 from mbagent.analysis.accuracy.samplers import CAUSAL, COMBINED, PREDICTOR
 from mbagent.analysis.accuracy.scores import Draws, Score
 from mbagent.analysis.accuracy.trials import TRIALS, Trial
-from mbagent.analysis.statistics import Interval
+from mbagent.analysis.statistics import Interval, mean_interval
 
 MEASURES: dict[str, str] = {
     "union": "Pearson, union",
@@ -66,17 +65,10 @@ class Statement:
     holds: bool
 
 
-def mean_interval(values: Iterable[float]) -> Cell:
-    """Mean and 95% t interval over seeds; NaN values are counted, not averaged."""
-    given = np.asarray(list(values), dtype=np.float64)
-    known = given[~np.isnan(given)]
-    if len(known) == 0:
-        return Cell(Interval(np.nan, np.nan, np.nan), len(given))
-    mean = float(known.mean())
-    half = 0.0
-    if len(known) > 1:
-        half = float(stats.t.ppf(0.975, len(known) - 1) * known.std(ddof=1) / np.sqrt(len(known)))
-    return Cell(Interval(mean, mean - half, mean + half), len(given) - len(known))
+def cell(values: Iterable[float]) -> Cell:
+    """Mean and interval over seeds; NaN values are counted, not averaged."""
+    given = list(values)
+    return Cell(mean_interval(given), int(np.isnan(given).sum()))
 
 
 def table(scores: Sequence[Score], trial: Trial) -> list[Line]:
@@ -89,7 +81,7 @@ def table(scores: Sequence[Score], trial: Trial) -> list[Line]:
             Line(
                 sampler,
                 draws,
-                {name: mean_interval(getattr(score, name) for score in group) for name in MEASURES},
+                {name: cell(getattr(score, name) for score in group) for name in MEASURES},
                 group[0].parameters,
                 float(np.mean([score.fit_seconds for score in group])),
                 float(np.median([score.sample_microseconds for score in group])),
@@ -104,7 +96,7 @@ def markdown_table(scores: Sequence[Score]) -> str:
 
     def mean(trial: Trial, sampler: str, draws: Draws, field: str, digits: int = 2) -> str:
         chosen = [s for s in scores if (s.trial, s.sampler, s.draws) == (trial.name, sampler, draws)]
-        estimate = mean_interval(getattr(s, field) for s in chosen).interval.estimate
+        estimate = mean_interval(getattr(s, field) for s in chosen).estimate
         return "–" if np.isnan(estimate) else f"{estimate:.{digits}f}"
 
     names = ("predictor, paper", "here", "combined, paper", "here", "causal: Pearson", "total variation", "valid mass")
@@ -138,7 +130,7 @@ def variant_table(scores: Sequence[Score]) -> list[VariantLine]:
 
     def cells(name: str, field: str) -> dict[str, Cell]:
         chosen = [score for score in scores if score.sampler == name]
-        return {trial: mean_interval(getattr(s, field) for s in chosen if s.trial == trial) for trial in trials}
+        return {trial: cell(getattr(s, field) for s in chosen if s.trial == trial) for trial in trials}
 
     names = dict.fromkeys(score.sampler for score in scores)
     return [VariantLine(name, cells(name, "union"), cells(name, "variation")) for name in names]
@@ -185,7 +177,7 @@ def _gain(scores: Sequence[Score], trial: str) -> np.ndarray:
 
 def _better_than_alone(scores: Sequence[Score]) -> Statement:
     gains = {trial.name: _gain(scores, trial.name) for trial in TRIALS if any(s.trial == trial.name for s in scores)}
-    cells = {name: mean_interval(gain).interval for name, gain in gains.items()}
+    cells = {name: mean_interval(gain) for name, gain in gains.items()}
     text = "; ".join(f"{name} {c.estimate:+.3f} [{c.low:+.3f}, {c.high:+.3f}]" for name, c in cells.items())
     holds = all(c.estimate > 0.0 for c in cells.values())
     return Statement("The combined sampler is always superior to the predictor alone", f"gain in correlation: {text}", holds)
@@ -212,10 +204,10 @@ def _zeros_and_ones(scores: Sequence[Score]) -> list[Statement]:
     for name, field in (("zero", "at_zero"), ("one", "at_one")):
         for sampler in (early, COMBINED):
             chosen = [getattr(s, field) for s in scores if s.sampler == sampler and s.draws == "many"]
-            figures[name, sampler] = mean_interval(chosen).interval.estimate
+            figures[name, sampler] = mean_interval(chosen).estimate
     zero, one = figures["zero", COMBINED], figures["one", COMBINED]
     mass = {
-        sampler: mean_interval(1.0 - s.valid for s in scores if s.sampler == sampler and s.draws == "many").interval.estimate
+        sampler: mean_interval(1.0 - s.valid for s in scores if s.sampler == sampler and s.draws == "many").estimate
         for sampler in (early, COMBINED)
     }
     return [

@@ -11,10 +11,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mbagent.analysis.accuracy.summary import mean_interval
 from mbagent.analysis.forecasts.experiment import CASES, Method, Outcome, Return, Score, Settings
 from mbagent.analysis.pages import FIGURE_STYLE, render, to_png
-from mbagent.analysis.statistics import Interval
+from mbagent.analysis.statistics import Interval, mean_interval
 
 MEASURES: dict[str, str] = {
     "joint": "total variation of the joint distribution",
@@ -61,14 +60,14 @@ def tables(scores: Sequence[Score], returns: Sequence[Return]) -> list[Table]:
         measure = next(name for name in MEASURES if all(np.isfinite(getattr(score, name)) for score in mine))
         rows = [_row([score for score in mine if score.n == n], n, measure) for n in sorted({score.n for score in mine})]
         played = [r for r in returns if r.case == case.name]
-        means = {kind: mean_interval(r.value for r in played if r.forecasts == kind).interval for kind in ("iterated", "direct")}
+        means = {kind: mean_interval(r.value for r in played if r.forecasts == kind) for kind in ("iterated", "direct")}
         found.append(Table(case.name, measure, rows, len({score.seed for score in mine}), means if played else {}))
     return found
 
 
 def _row(scores: Sequence[Score], n: int, measure: str) -> Row:
     def mean(method: Method, field: str) -> Interval:
-        return mean_interval(getattr(score, field) for score in scores if score.method == method).interval
+        return mean_interval(getattr(score, field) for score in scores if score.method == method)
 
     errors = {method: mean(method, measure) for method in _LOOKS}
     marginals = {method: mean(method, "marginal") for method in _LOOKS}

@@ -14,7 +14,7 @@ from mbagent.analysis.accuracy.page import write_page
 from mbagent.analysis.accuracy.results import first_points, load_points, load_scores, save_points, save_scores
 from mbagent.analysis.accuracy.samplers import COMBINED, PREDICTOR, FitOptions
 from mbagent.analysis.accuracy.scores import Score
-from mbagent.analysis.accuracy.summary import mean_interval, paper_parameters, statements
+from mbagent.analysis.accuracy.summary import cell, paper_parameters, statements
 from mbagent.analysis.accuracy.trials import find_trial
 from mbagent.models.boltzmann import BoltzmannConfig
 from mbagent.models.config import NeuralConfig
@@ -76,10 +76,10 @@ def test_hidden_nodes_are_those_of_the_paper() -> None:
 
 
 def test_means_leave_out_what_is_undefined_and_count_it() -> None:
-    cell = mean_interval([1.0, 2.0, 3.0, float("nan")])
-    assert (cell.interval.estimate, cell.undefined) == (2.0, 1)
-    assert cell.interval.low == pytest.approx(2.0 - 4.302653 / np.sqrt(3), abs=1e-5)  # t at 2 degrees of freedom
-    assert mean_interval([float("nan")]).undefined == 1
+    found = cell([1.0, 2.0, 3.0, float("nan")])
+    assert (found.interval.estimate, found.undefined) == (2.0, 1)
+    assert found.interval.low == pytest.approx(2.0 - 4.302653 / np.sqrt(3), abs=1e-5)  # t at 2 degrees of freedom
+    assert cell([float("nan")]).undefined == 1
 
 
 def score(trial: str, sampler: str, union: float, **more: float) -> Score:
