@@ -36,6 +36,9 @@ ModelBuilder: TypeAlias = Callable[[int], BaseTransitionModel]
 
 LARGEST_NUMBER = 2**62
 
+_REST = 1 << 32
+"""Salt of the random numbers of steps after a direct forecast: no number of steps is as large."""
+
 
 def iterate(model: TransitionModel, states: States, strings: Actions, rng: Randomness) -> tuple[States, Bools]:
     """A draw of where each string of actions leads, step by step; a terminated row stays where it ended.
@@ -188,7 +191,9 @@ class DirectForecastModel(BaseTransitionModel):
         reached, over = self.direct[first].sample(states, number_strings(strings[:, :first], self.n_actions), derive(keys, first))
         go_on = np.flatnonzero(~over)
         if n > first and len(go_on):
-            reached[go_on], over[go_on] = iterate(self.one_step, reached[go_on], strings[go_on, first:], keys[go_on])
+            reached[go_on], over[go_on] = iterate(
+                self.one_step, reached[go_on], strings[go_on, first:], derive(keys[go_on], _REST)
+            )
         return reached, over
 
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:

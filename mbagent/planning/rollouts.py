@@ -9,6 +9,9 @@ from mbagent.models.forecasts import DirectForecastModel
 from mbagent.planning.goal import Goal
 from mbagent_envs.random_keys import derive, uniforms
 
+_STRING = 1 << 32
+"""Salt of a string's random numbers: no depth is as large, so no step's numbers are used twice."""
+
 
 def random_returns(
     model: TransitionModel,
@@ -70,7 +73,7 @@ def forecast_returns(
         float64 [B].
     """
     total = np.zeros(len(states))
-    strings = (uniforms(derive(keys, 1), horizon) * model.n_actions).astype(np.int64)
+    strings = (uniforms(derive(keys, _STRING), horizon) * model.n_actions).astype(np.int64)
     strings[:, 0] = first_actions
     for depth in range(horizon):
         step_keys = derive(keys, depth)

@@ -46,9 +46,9 @@ class Score:
         variation: total variation, mean over inputs.
         valid: generated mass on observed outcomes, mean over inputs.
         log_likelihood: nats an observation, from exact probabilities; else NaN.
-        at_zero: mean probability given to the generated outcomes that were never observed.
+        at_zero: mean probability given to outcomes that were never observed; NaN where they are too many to list.
         at_one: mean probability given to outcomes that were always observed; NaN if there are none.
-        parameters: number of weights.
+        parameters: number of weights that are not pruned.
         fit_seconds, sample_microseconds: processor time of the fit, and of one draw.
     """
 
@@ -91,22 +91,21 @@ class Bench:
         self.add(sampler, "exact", found, size(model), seconds, log_likelihood=s.log_likelihood(self.truth, found))
 
     def many(self, sampler: str, model: TransitionModel, seconds: float, *, keep: bool = False, slow: bool = False) -> None:
-        """Scores a model by many independent draws; ``keep`` keeps the points for the scatter plot.
+        """Scores a model by c and by many independent draws; ``keep`` keeps the points of the latter for the scatter plot.
 
         ``slow`` samplers draw at most ``FEW_DRAWS`` times where variables are many.
         """
         n_draws = min(self.n_draws, FEW_DRAWS) if slow and self.data.d > s.EXHAUSTIVE else self.n_draws
+        self._drawn(sampler, "c", model, seconds, self.data.outputs.shape[1])
         found = self._drawn(sampler, "many", model, seconds, n_draws)
         if keep:
             self.points[sampler] = np.stack(align(self.truth, found), axis=1)
 
     def every_way(self, sampler: str, model: TransitionModel, seconds: float) -> None:
         """By exact probabilities, many draws, c draws and c systematic draws."""
-        c = self.data.outputs.shape[1]
         self.exact(sampler, model, seconds)
         self.many(sampler, model, seconds)
-        self._drawn(sampler, "c", model, seconds, c)
-        found = s.draw_systematically(model, self.data, c, self.seed)
+        found = s.draw_systematically(model, self.data, self.data.outputs.shape[1], self.seed)
         self.add(sampler, "c systematic", found, size(model), seconds)
 
     def _drawn(self, sampler: str, draws: Draws, model: TransitionModel, seconds: float, n: int) -> Distribution:
@@ -119,7 +118,8 @@ class Bench:
         self, sampler: str, draws: Draws, found: Distribution, parameters: int = 0, seconds: float = NAN, **more: float
     ) -> None:
         """Scores a distribution; ``more`` are further fields of the score."""
-        truth, d, listed = self.truth, self.data.d, found.complete
+        truth, d = self.truth, self.data.d
+        countable = found.complete and d <= s.EXHAUSTIVE
         p, q = align(truth, found)
         self.scores.append(
             Score(
@@ -129,10 +129,10 @@ class Bench:
                 draws=draws,
                 union=union_correlation(truth, found) if draws != "exact" else NAN,
                 seen=observed_correlation(truth, found),
-                full=full_correlation(truth, found, d) if listed and d <= s.EXHAUSTIVE else NAN,
+                full=full_correlation(truth, found, d) if countable else NAN,
                 variation=total_variation(truth, found),
                 valid=valid_mass(truth, found),
-                at_zero=_mean(q[p == 0.0]) if listed else NAN,
+                at_zero=float(q[p == 0.0].sum()) / (truth.n * 2**d - int((p > 0.0).sum())) if countable else NAN,
                 at_one=_mean(q[p > 1.0 - 1e-9]),
                 parameters=parameters,
                 fit_seconds=seconds,
@@ -142,8 +142,11 @@ class Bench:
 
 
 def size(model: TransitionModel) -> int:
-    """Number of weights."""
-    return sum(int(np.size(array)) for array in model.state_dict().values())
+    """Number of weights that are not pruned."""
+    arrays = model.state_dict()
+    masks = {name: array for name, array in arrays.items() if array.dtype == np.bool_}
+    pruned = sum(int((~mask).sum()) for name, mask in masks.items() if name.endswith(".mask"))
+    return sum(int(array.size) for name, array in arrays.items() if name not in masks) - pruned
 
 
 def _mean(values: NDArray[np.float64]) -> float:
