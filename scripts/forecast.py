@@ -12,6 +12,7 @@ import os
 # Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import shlex
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,7 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
+from mbagent.analysis.folders import set_aside
 from mbagent.analysis.forecasts.experiment import CASES, Outcome, Return, Score, Settings, plan, run_task, save_csv
 from mbagent.analysis.forecasts.page import write_page
 from mbagent.analysis.parallel import run_all
@@ -49,7 +51,7 @@ class Args:
     episodes: int | None = None
     """Episodes that flat Monte Carlo plays with either kind of forecasts; by default 0, with --full 3."""
     output: Path = Path("results/forecast")
-    """Folder for the page, the figure and the tables."""
+    """Folder for the page, the figure and the tables; earlier ones there are moved to a folder of their own inside it."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Number of processes, each with one thread."""
 
@@ -83,12 +85,18 @@ def main(argv: list[str] | None = None) -> int:
     console = Console()
     try:
         settings = settings_of(args)
+        if args.workers < 1:
+            raise ValueError(f"--workers must be at least 1 process, got {args.workers}.")
+        if args.output.exists() and not args.output.is_dir():
+            raise ValueError(f"--output must be a folder, and {args.output} is a file.")
     except ValueError as error:
         console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
         return 1
     args.output.mkdir(parents=True, exist_ok=True)
+    if moved := set_aside(args.output):
+        console.print(f"Moved earlier results to {moved}.", highlight=False, soft_wrap=True)
     outcomes: list[Outcome] = []
-    command = " ".join(["python scripts/forecast.py", *(sys.argv[1:] if argv is None else argv)])
+    command = shlex.join(["python", "scripts/forecast.py", *(sys.argv[1:] if argv is None else argv)])
     for outcome in run_all(run_task, plan(settings), workers=args.workers, console=console, name=_line):
         outcomes.append(outcome)
         save_csv(args.output / "results.csv", [score for o in outcomes for score in o.scores], Score)

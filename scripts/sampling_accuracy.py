@@ -13,6 +13,7 @@ import os
 # Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import shlex
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,10 +24,20 @@ from rich.console import Console
 
 from mbagent.analysis.accuracy.experiment import FIRST_SCORED_SEED, Outcome, Part, Settings, Task, collect, plan, run_task
 from mbagent.analysis.accuracy.page import write_page
-from mbagent.analysis.accuracy.results import Points, first_points, load_points, load_scores, save_points, save_scores
+from mbagent.analysis.accuracy.results import (
+    Points,
+    first_points,
+    load_points,
+    load_scores,
+    load_settings,
+    save_points,
+    save_scores,
+    save_settings,
+)
 from mbagent.analysis.accuracy.samplers import FitOptions
 from mbagent.analysis.accuracy.scores import Score
 from mbagent.analysis.accuracy.trials import TRIALS
+from mbagent.analysis.folders import set_aside
 from mbagent.analysis.parallel import run_all
 
 QUICK_TRIALS = tuple(trial.name for trial in TRIALS if trial.options.d <= 8)
@@ -44,7 +55,7 @@ class Args:
     """Every sampler in every trial; the combined sampler with one thing changed at a time; growing numbers of variables.
     By default the first, with --full all."""
     seeds: int | None = None
-    """Data sets for each trial; by default 3."""
+    """Data sets for each trial, at most 20 (60 of the tiniest, 5 of the largest); by default 3, with --full all."""
     first_seed: int = FIRST_SCORED_SEED
     """Number of the first data set; those below 1000 are for choosing settings."""
     n_draws: int = 1000
@@ -58,9 +69,9 @@ class Args:
     fit: FitOptions = field(default_factory=FitOptions)
     """How the paper's networks are fitted."""
     output: Path = Path("results/sampling_accuracy")
-    """Folder for the page and results.csv."""
+    """Folder for the page and results.csv; results of an earlier run there are moved to a folder of their own inside it."""
     resume: bool = False
-    """Keep the data sets that results.csv in the folder already has; they must have been measured with the same options."""
+    """Keep the data sets that the folder already has; they must have been measured with the same options."""
     report_only: bool = False
     """Only write the page again, from what an earlier run left in the folder."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
@@ -71,26 +82,44 @@ def settings_of(args: Args) -> Settings:
     """The settings that the options stand for."""
     trials = args.trials if args.trials is not None else tuple(t.name for t in TRIALS) if args.full else QUICK_TRIALS
     seeds = args.seeds if args.seeds is not None or args.full else 3
-    if seeds is not None and seeds < 1:
-        raise ValueError(f"--seeds must be at least 1 data set, got {seeds}.")
-    if args.n_draws < 1:
-        raise ValueError(f"--n-draws must be at least 1, got {args.n_draws}.")
     parts: tuple[Part, ...] = args.parts if args.parts is not None else get_args(Part) if args.full else ("samplers",)
     return Settings(trials, seeds, args.first_seed, args.n_draws, args.fit, args.relates, args.shuffle, args.multiplier, parts)
+
+
+def prepare(args: Args, settings: Settings, console: Console) -> Settings:
+    """Makes the folder ready for a run, or for what is left of one; returns the settings that its figures have.
+
+    Raises:
+        ValueError: there is nothing to go on with, or it was measured with other options.
+    """
+    if args.output.exists() and not args.output.is_dir():
+        raise ValueError(f"--output must be a folder, and {args.output} is a file.")
+    if args.workers < 1:
+        raise ValueError(f"--workers must be at least 1 process, got {args.workers}.")
+    kept = args.output / "settings.json"
+    if args.report_only:
+        return load_settings(kept)
+    args.output.mkdir(parents=True, exist_ok=True)
+    if args.resume and kept.exists():
+        if load_settings(kept).measured() != settings.measured():
+            raise ValueError(f"{args.output} was measured with other options ({kept}); give those, or another --output.")
+    elif moved := set_aside(args.output):
+        console.print(f"Moved earlier results to {moved}.", highlight=False, soft_wrap=True)
+    save_settings(kept, settings)
+    return settings
 
 
 def _line(outcome: Outcome) -> str:
     return f"{outcome.task.part}, {outcome.task.trial}, data set {outcome.task.seed}"
 
 
-def _run(args: Args, settings: Settings, tasks: list[Task], console: Console) -> tuple[dict[Part, list[Score]], Points]:
-    """Does the tasks, saving after each; returns all scores that are in the folder then, by part, and the points."""
+def measure(args: Args, tasks: list[Task], console: Console) -> tuple[dict[Part, list[Score]], Points]:
+    """Does the tasks that are not done, saving after each; returns all scores in the folder, by part, and the points."""
     tables = {part: args.output / f"{'results' if part == 'samplers' else part}.csv" for part in get_args(Part)}
-    fresh = set() if args.resume or args.report_only else set(settings.parts)
-    kept = {part: [] if part in fresh else load_scores(path) for part, path in tables.items()}
-    drawn = {} if "samplers" in fresh else load_points(args.output / "points.npz")
+    kept = {part: load_scores(path) for part, path in tables.items()}
+    drawn = load_points(args.output / "points.npz")
     done = {(part, score.trial, score.seed) for part, scores in kept.items() for score in scores}
-    todo = [task for task in tasks if (task.part, task.trial, task.seed) not in done and not args.report_only]
+    todo = [task for task in tasks if (task.part, task.trial, task.seed) not in done]
     outcomes: list[Outcome] = []
     for outcome in run_all(run_task, todo, workers=args.workers, console=console, name=_line):
         outcomes.append(outcome)
@@ -107,17 +136,16 @@ def main(argv: list[str] | None = None) -> int:
     args = tyro.cli(Args, args=argv, description=__doc__.splitlines()[0])
     console = Console()
     try:
-        settings = settings_of(args)
-        tasks = plan(settings)
+        settings = prepare(args, settings_of(args), console)
+        scores, points = measure(args, [] if args.report_only else plan(settings), console)
+        if not any(scores.values()):
+            raise ValueError(f"There are no results in {args.output}: measure first.")
     except ValueError as error:
         console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
         return 1
-    args.output.mkdir(parents=True, exist_ok=True)
-    scores, points = _run(args, settings, tasks, console)
-    given = sys.argv[1:] if argv is None else argv
-    command = " ".join(["python scripts/sampling_accuracy.py", *given])
+    command = shlex.join(["python", "scripts/sampling_accuracy.py", *(sys.argv[1:] if argv is None else argv)])
     write_page(args.output / "report.html", scores, points, settings, command)
-    console.print(f"Wrote {args.output / 'report.html'} and {args.output / 'results.csv'}.")
+    console.print(f"Wrote report.html and the figures behind it to {args.output}.", highlight=False, soft_wrap=True)
     return 0
 
 

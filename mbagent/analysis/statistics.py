@@ -33,12 +33,12 @@ class Interval:
 
 
 def mean_interval(values: Iterable[float]) -> Interval:
-    """Mean with its 95% t interval; NaN values are left out, and nothing else makes it NaN."""
+    """Mean with its 95% t interval; NaN values are left out. One value has no interval: its ends are NaN."""
     given = np.asarray(list(values), dtype=np.float64)
     known = given[~np.isnan(given)]
     if len(known) == 0:
         return Interval(np.nan, np.nan, np.nan)
-    mean, half = float(known.mean()), 0.0
+    mean, half = float(known.mean()), np.nan
     if len(known) > 1:
         half = float(stats.t.ppf(0.975, len(known) - 1) * known.std(ddof=1) / np.sqrt(len(known)))
     return Interval(mean, mean - half, mean + half)

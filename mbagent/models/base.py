@@ -30,6 +30,9 @@ Keys: TypeAlias = NDArray[np.uint64]
 Randomness: TypeAlias = np.random.Generator | Keys
 """A Generator, or keys uint64 [B], one a row, so that no row's draw depends on another row."""
 
+LARGEST_NUMBER = 2**62
+"""Actions, and strings of actions that are one action of a model, are numbered up to here."""
+
 
 @dataclass(frozen=True)
 class FitReport:

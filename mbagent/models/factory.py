@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from mbagent.models.base import BaseTransitionModel, TransitionModel
 from mbagent.models.config import NeuralConfig
-from mbagent.models.forecasts import DirectForecastModel
+from mbagent.models.forecasts import DirectForecastModel, longest_string
 from mbagent.models.neural import NeuralTransitionModel
 from mbagent.models.plane_strings import PlaneStringPredictor
 from mbagent.models.planes import PlanePredictor
@@ -63,9 +63,14 @@ def build_string(space: FactoredSpace, n_actions: int, learning_rate: float, n_s
 
 
 def build_direct(
-    space: FactoredSpace, n_actions: int, learning_rate: float, steps: Sequence[int] = DIRECT_STEPS
+    space: FactoredSpace, n_actions: int, learning_rate: float, steps: Sequence[int] | None = None
 ) -> DirectForecastModel:
-    """The model of ``build_auto``, and beside it one model for each of several numbers of steps."""
+    """The model of ``build_auto``, and beside it one model for each of several numbers of steps.
+
+    By default ``DIRECT_STEPS``, as far as strings of so many actions can be numbered.
+    """
+    if steps is None:
+        steps = [n for n in DIRECT_STEPS if n <= longest_string(n_actions)]
     return DirectForecastModel(
         build_auto(space, n_actions, learning_rate),
         lambda n_steps: build_string(space, n_actions, learning_rate, n_steps),

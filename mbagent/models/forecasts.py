@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.base import (
+    LARGEST_NUMBER,
     Actions,
     BaseTransitionModel,
     Bools,
@@ -33,8 +34,6 @@ from mbagent_envs.random_keys import derive, uniforms
 
 ModelBuilder: TypeAlias = Callable[[int], BaseTransitionModel]
 """``build(n)``: an unfitted model whose action is a string of n actions, numbered as ``number_strings`` does."""
-
-LARGEST_NUMBER = 2**62
 
 _REST = 1 << 32
 """Salt of the random numbers of steps after a direct forecast: no number of steps is as large."""
@@ -66,9 +65,11 @@ def number_strings(strings: Actions, n_actions: int) -> Actions:
     """Number of each string int64 [B, n]: its digits in base ``n_actions``, the first action lowest. Int64 [B].
 
     Raises:
-        ValueError: the strings are too long to be numbered.
+        ValueError: the strings are too long to be numbered, or an action does not exist.
     """
     n = strings.shape[1]
+    if strings.size and not (strings.min() >= 0 and strings.max() < n_actions):
+        raise ValueError(f"Strings are made of actions 0 ... {n_actions - 1}, got {strings.min()} ... {strings.max()}.")
     if n_actions**n > LARGEST_NUMBER:
         raise ValueError(
             f"Strings of {n} actions out of {n_actions} are too many to number; forecast fewer steps directly, "
@@ -90,7 +91,8 @@ def steps_apart(data: TransitionDataset, n: int, seed: int = 0) -> TransitionDat
     """The transitions between states ``n`` steps apart, with the strings of actions between them as actions.
 
     An episode that terminates within the string stays in its last state; the actions left over are random. Where
-    an episode was cut off, the string is left out.
+    an episode was cut off, the string is left out; and where the longest episode was cut off, so are all strings that start
+    too near to that limit, ended or not: to keep only those that ended would make ends look likelier than they are.
 
     Args:
         data: transitions of single steps, in the order met within each episode.
@@ -118,6 +120,7 @@ def steps_apart(data: TransitionDataset, n: int, seed: int = 0) -> TransitionDat
         going = whole & ~over
         strings[going, step], last[going] = rows.actions[here[going]], here[going]
         over[going] = rows.terminated[last[going]]
+    whole &= _far_from_limit(rows, n)
     first, end = start[whole], last[whole]
     result.append(
         TransitionBatch(
@@ -130,6 +133,17 @@ def steps_apart(data: TransitionDataset, n: int, seed: int = 0) -> TransitionDat
         )
     )
     return result
+
+
+def _far_from_limit(rows: TransitionBatch, n: int) -> Bools:
+    """Which rows, in the order of their episodes, lie at least ``n`` steps before the limit on the length of episodes."""
+    if len(rows) == 0:
+        return np.zeros(0, dtype=np.bool_)
+    _, first, lengths = np.unique(rows.episodes, return_index=True, return_counts=True)
+    ended = rows.terminated[first + lengths - 1]
+    limit = lengths.max() if not ended[lengths == lengths.max()].all() else np.inf
+    far: Bools = np.arange(len(rows)) - np.repeat(first, lengths) + n <= limit
+    return far
 
 
 class DirectForecastModel(BaseTransitionModel):
@@ -154,10 +168,18 @@ class DirectForecastModel(BaseTransitionModel):
             raise ValueError(f"Numbers of steps with a model of their own must be 2 or more, got {sorted(steps)}.")
         limit = longest_string(self.n_actions)
         if any(n > limit for n in steps):
-            raise ValueError(f"With {self.n_actions} actions, strings have at most {limit} of them, got {max(steps)}.")
+            raise ValueError(
+                f"Strings of {max(steps)} actions out of {self.n_actions} are too many to number; "
+                f"choose numbers of steps up to {limit}."
+            )
         self.one_step = one_step
         self.direct = {n: build(n) for n in sorted(steps)}
         self._known: set[int] = set()
+
+    @property
+    def known(self) -> frozenset[int]:
+        """Numbers of steps whose model is fitted."""
+        return frozenset(self._known)
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel; the report is that of the one-step model. Episodes too short for n steps leave n unlearned."""
@@ -227,13 +249,13 @@ class DirectForecastModel(BaseTransitionModel):
         before = self.state_dict()
         try:
             self._take(state)
-        except (ValueError, KeyError):
+        except Exception:
             self._take(before)
             raise
 
     def _take(self, state: Mapping[str, NDArray[Any]]) -> None:
         parts = {1: self.one_step, **self.direct}
-        known = [int(n) for n in state.get("known", ())]
+        known = [int(n) for n in np.ravel(state.get("known", ()))]
         prefixes = {f"steps{n}" for n in parts}
         foreign = [name for name in state if name != "known" and name.partition(".")[0] not in prefixes]
         if foreign or "known" not in state or not set(known) <= set(self.direct):

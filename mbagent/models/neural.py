@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from mbagent.models.base import (
+    LARGEST_NUMBER,
     Actions,
     BaseTransitionModel,
     Bools,
@@ -57,6 +58,11 @@ class NeuralTransitionModel(BaseTransitionModel):
         n_steps: int = 1,
         seed: int = 0,
     ) -> None:
+        if n_steps < 1 or n_actions**n_steps > LARGEST_NUMBER:
+            raise ValueError(
+                f"A model's action is a string of 1 or more actions, at most {LARGEST_NUMBER:.0e} strings in all; "
+                f"got n_steps = {n_steps} with {n_actions} actions."
+            )
         super().__init__(cardinalities, n_actions**n_steps)
         self.config = config or NeuralConfig()
         self.codec = FactorCodec(self.cardinalities, n_actions, n_steps)
@@ -173,7 +179,7 @@ class NeuralTransitionModel(BaseTransitionModel):
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
         """See TransitionModel."""
         keys = as_keys(rng, len(states))
-        states, actions = _rows(states, actions)
+        states, actions = _rows(states, actions, len(self.cardinalities))
         logits, probs = self._predict(states, actions)
         config = self.config
         if config.conditioner is None:
@@ -213,7 +219,7 @@ class NeuralTransitionModel(BaseTransitionModel):
 
     def probabilities(self, states: States, actions: Actions) -> Floats:
         """The predictor's output for every factor, ``terminated`` last: float64 [B, O, K], 0 where a factor lacks a value."""
-        return self._predict(*_rows(states, actions))[1]
+        return self._predict(*_rows(states, actions, len(self.cardinalities)))[1]
 
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
         """See TransitionModel; exact for the distribution that ``sample`` draws from."""
@@ -222,7 +228,7 @@ class NeuralTransitionModel(BaseTransitionModel):
                 'A conditioner with mask "others" samples by sweeps and has no exact probabilities; '
                 'use NeuralConfig(conditioner="causal").'
             )
-        states, actions = _rows(states, actions)
+        states, actions = _rows(states, actions, len(self.cardinalities))
         outcomes = np.concatenate([next_states, terminated[:, None]], axis=1).astype(np.int64)
         logits, probs = self._predict(states, actions)
         if self.config.conditioner is None:
@@ -235,7 +241,7 @@ class NeuralTransitionModel(BaseTransitionModel):
         """See TransitionModel; systematic draws where probabilities are exact (``systematic.py``), else plain draws."""
         if self.config.conditioner == "others":
             return super().successors(states, actions, n_samples, seed)
-        states, actions = _rows(states, actions)
+        states, actions = _rows(states, actions, len(self.cardinalities))
         logits, probs = self._predict(states, actions)
         if self.config.conditioner is None:
             return independent_successors(probs, self._layout.outputs, n_samples, seed)
@@ -311,6 +317,12 @@ class NeuralTransitionModel(BaseTransitionModel):
         return logits, probabilities(logits, self._layout.outputs)
 
 
-def _rows(states: States, actions: Actions) -> tuple[States, Actions]:
-    """Both as contiguous int64, the one form that the compiled kernels take."""
-    return np.ascontiguousarray(states, dtype=np.int64), np.ascontiguousarray(actions, dtype=np.int64)
+def _rows(states: States, actions: Actions, n_factors: int) -> tuple[States, Actions]:
+    """Both as contiguous int64, the one form that the compiled kernels take, which look at no shape."""
+    states, actions = np.ascontiguousarray(states, dtype=np.int64), np.ascontiguousarray(actions, dtype=np.int64)
+    if states.ndim != 2 or states.shape[1] != n_factors or actions.shape != (len(states),):
+        raise ValueError(
+            f"A model of {n_factors} factors needs states [B, {n_factors}] and actions [B], "
+            f"got shapes {states.shape} and {actions.shape}."
+        )
+    return states, actions

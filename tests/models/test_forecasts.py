@@ -60,8 +60,10 @@ def test_strings_too_long_to_be_numbered_are_refused() -> None:
     assert longest_string(4) == 31
     with pytest.raises(ValueError, match="at most 31"):
         number_strings(np.zeros((1, 32), dtype=np.int64), 4)
-    with pytest.raises(ValueError, match="at most 62"):
+    with pytest.raises(ValueError, match="up to 62"):
         ring_model((63,))
+    with pytest.raises(ValueError, match=r"actions 0 ... 3, got 2 ... 4"):
+        number_strings(np.array([[2, 4]]), 4)
     with pytest.raises(ValueError, match="2 or more"):
         ring_model((1,))
 
@@ -87,6 +89,23 @@ def test_states_some_steps_apart_are_those_of_one_episode() -> None:
     np.testing.assert_array_equal(steps_apart(data, 1).rows().next_states, data.rows().next_states[[0, 2, 4, 1, 3]])
     with pytest.raises(ValueError, match="n = 0"):
         steps_apart(data, 0)
+
+
+def test_ends_near_a_limit_on_episodes_look_no_likelier_than_they_are() -> None:
+    # An episode ends with probability 0.1 at each step and is cut off after 10; strings of 5 end with 1 - 0.9^5 = 0.41.
+    lengths = np.random.default_rng(0).geometric(0.1, size=4000)
+    ended, lengths = lengths <= 10, np.minimum(lengths, 10)
+    n = int(lengths.sum())
+    index = np.arange(n) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    last = index == np.repeat(lengths, lengths) - 1
+    states = index[:, None]
+    data = TransitionDataset((12,), 2)
+    episodes = np.repeat(np.arange(4000), lengths)
+    zeros = np.zeros(n, dtype=np.int64)
+    data.append(TransitionBatch(states, zeros, states + 1, last & np.repeat(ended, lengths), np.zeros(n), episodes))
+    share = steps_apart(data, 5).rows().terminated
+    assert abs(share.mean() - (1 - 0.9**5)) < 0.02
+    assert len(steps_apart(data, 11)) == 0
 
 
 def test_iterating_goes_where_the_steps_go_and_stays_where_an_episode_ended() -> None:
@@ -139,6 +158,12 @@ def test_weights_are_kept_and_foreign_ones_refused() -> None:
             other.load_state_dict(wrong)
         after = other.state_dict()
         assert all(np.array_equal(after[name], value) for name, value in before.items())
+
+
+def test_a_default_fits_any_number_of_actions() -> None:
+    space = FactoredSpace(GeyserRunner(width=6).observation_space)
+    assert sorted(build_direct(space, 3, 0.02).direct) == list(range(2, 16))
+    assert sorted(build_direct(space, 4096, 0.02).direct) == [2, 3, 4, 5]
 
 
 def test_compiled_networks_of_strings_are_the_trained_ones() -> None:

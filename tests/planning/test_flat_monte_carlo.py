@@ -1,5 +1,7 @@
 """Flat Monte Carlo, step by step and with forecasts of several steps."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from mbagent.models.forecasts import DirectForecastModel
 from mbagent.planning.flat_monte_carlo import FlatMonteCarlo
 from mbagent.planning.planner import PlannerSettings
 from mbagent.planning.rollouts import forecast_returns, random_returns
-from mbagent_envs.random_keys import derive
+from mbagent_envs.random_keys import derive, uniforms
 from tests.worlds import TableWorld, arrival_goal, random_table
 
 
@@ -43,6 +45,48 @@ def test_exact_forecasts_give_the_mean_return_of_going_step_by_step(ends: tuple[
     forecast = forecast_returns(model, goal, starts, derive(2, keys), 5, 0.9, first)
     error = np.sqrt((stepwise.var() + forecast.var()) / n)
     assert abs(stepwise.mean() - forecast.mean()) < 5 * error
+
+
+class CoinWorld(TableWorld):
+    """Coins that are thrown again at every step; as a model of n steps, too. Coin i is drawn at number i of the key."""
+
+    def __init__(self, n_actions: int = 2) -> None:
+        super().__init__(np.ones((2, n_actions, 2)))
+        self.cardinalities = (2, 2, 2)
+
+    def sample(self, states: np.ndarray, actions: np.ndarray, rng: Any) -> tuple[np.ndarray, np.ndarray]:
+        return (uniforms(rng, 3) < 0.5).astype(np.int64), np.zeros(len(states), dtype=np.bool_)
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        return {}
+
+    def load_state_dict(self, state: Any) -> None:
+        pass
+
+
+@pytest.mark.parametrize("coin", [0, 1, 2])
+def test_no_random_number_decides_both_an_action_and_an_outcome(coin: int) -> None:
+    n = 20_000
+    model = DirectForecastModel(CoinWorld(), lambda k: CoinWorld(2**k), (2,))
+    model.load_state_dict({"known": np.array([2])})
+
+    def goal(states: np.ndarray, actions: np.ndarray, following: np.ndarray) -> np.ndarray:
+        hit: np.ndarray = ((actions == 0) & (following[:, coin] == 0)).astype(np.float64)
+        return hit
+
+    starts, first = np.zeros((n, 3), dtype=np.int64), np.zeros(n, dtype=np.int64)
+    returns = forecast_returns(model, goal, starts, derive(1, np.arange(n)), 3, 1.0, first)
+    assert abs(returns.mean() - (0.5 + 0.25 + 0.25)) < 5 * returns.std() / np.sqrt(n)
+
+
+def test_the_steps_after_a_forecast_have_random_numbers_of_their_own() -> None:
+    n = 4000
+    model = DirectForecastModel(CoinWorld(), lambda k: CoinWorld(2**k), (2,))
+    model.load_state_dict({"known": np.array([2])})
+    starts, keys = np.zeros((n, 3), dtype=np.int64), derive(3, np.arange(n))
+    ends = [model.forecast(starts, np.zeros((n, steps), dtype=np.int64), keys)[0][:, 0] for steps in range(2, 8)]
+    agreement = [(ends[0] == later).mean() for later in ends[1:]]
+    assert max(abs(share - 0.5) for share in agreement) < 5 * 0.5 / np.sqrt(n)
 
 
 def test_a_model_without_forecasts_is_refused() -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -24,6 +24,8 @@ FEW_ITERATIONS = 25
 
 SLOW_SEEDS = 5
 """The Boltzmann machine, a yardstick that takes longer than all else together, is fitted to so many data sets of a trial."""
+
+MOST_DRAWS = 1_000_000
 
 Part = Literal["samplers", "variants", "scaling"]
 """Every sampler in every trial; the combined sampler with one thing changed at a time; growing numbers of variables."""
@@ -45,6 +47,9 @@ class Settings:
         fit: how the paper's networks are fitted.
         relates, shuffle, multiplier: see DataOptions.
         parts: see Part.
+
+    Raises:
+        ValueError: a setting is out of range.
     """
 
     trials: tuple[str, ...] = tuple(trial.name for trial in TRIALS)
@@ -56,6 +61,29 @@ class Settings:
     shuffle: Literal["output", "input"] = "output"
     multiplier: float = 1.0
     parts: tuple[Part, ...] = ("samplers",)
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        names = [trial.name for trial in TRIALS]
+        for name in self.trials:
+            if name not in names:
+                raise ValueError(f"There is no trial {name!r}; choose from {', '.join(names)}.")
+        if self.seeds is not None and self.seeds < 1:
+            raise ValueError(f"seeds must be at least 1 data set, got {self.seeds}.")
+        if self.first_seed < 0:
+            raise ValueError(f"first_seed must be 0 or more, got {self.first_seed}.")
+        if not 1 <= self.n_draws <= MOST_DRAWS:
+            raise ValueError(f"n_draws must lie between 1 and {MOST_DRAWS:,}, got {self.n_draws:,}.")
+        if not plan(self):
+            raise ValueError(
+                "There is nothing to measure: name at least one trial and one part "
+                f"(variants are measured in {', '.join(VARIED)})."
+            )
+
+    def measured(self) -> dict[str, Any]:
+        """What decides a figure, as plain values: two runs may be put together where it is equal."""
+        kept = asdict(self)
+        return {name: kept[name] for name in ("n_draws", "relates", "shuffle", "multiplier", "fit")}
 
 
 @dataclass(frozen=True)
@@ -88,8 +116,8 @@ class Outcome:
 def plan(settings: Settings) -> list[Task]:
     """All tasks, the longest first."""
     tasks: list[Task] = []
-    chosen = [find_trial(name) for name in settings.trials]
-    for part in settings.parts:
+    chosen = [find_trial(name) for name in dict.fromkeys(settings.trials)]
+    for part in dict.fromkeys(settings.parts):
         for trial in SCALING if part == "scaling" else chosen:
             n = min(_seeds(part, trial), settings.seeds or 10**9)
             tasks += [Task(trial.name, settings.first_seed + i, settings, part) for i in range(n)]

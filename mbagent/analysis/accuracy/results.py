@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import TypeAlias, get_type_hints
+from typing import Any, TypeAlias, get_type_hints
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.analysis.accuracy.experiment import Outcome
+from mbagent.analysis.accuracy.experiment import Outcome, Settings
+from mbagent.analysis.accuracy.samplers import FitOptions
 from mbagent.analysis.accuracy.scores import Score
+from mbagent.analysis.accuracy.trials import find_trial
+from mbagent.analysis.folders import replaced
 
 Points: TypeAlias = dict[tuple[str, str], NDArray[np.float64]]
 """(trial, sampler) -> pairs (observed, inferred) [M, 2] of one data set."""
@@ -31,31 +36,74 @@ def first_points(outcomes: Sequence[Outcome]) -> Points:
 
 def save_points(path: Path, points: Points) -> None:
     """Writes points as ``.npz``."""
-    np.savez_compressed(path, allow_pickle=False, **{"|".join(key): value for key, value in points.items()})
+    with replaced(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **{"|".join(key): value for key, value in points.items()})
 
 
 def load_points(path: Path) -> Points:
-    """Reads what ``save_points`` wrote; nothing where there is no such file."""
+    """Reads what ``save_points`` wrote; nothing where there is no such file.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
     if not path.exists():
         return {}
-    with np.load(path, allow_pickle=False) as archive:
-        pairs = {name: archive[name] for name in archive}
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            pairs = {name: archive[name] for name in archive}
+    except (OSError, EOFError, ValueError, BadZipFile) as error:
+        raise ValueError(f"{path} cannot be read ({error}); delete it, or measure anew without --resume.") from error
     return {(name.partition("|")[0], name.partition("|")[2]): value for name, value in pairs.items()}
 
 
 def save_scores(path: Path, scores: Sequence[Score]) -> None:
     """Writes a csv with a line for each sampler and data set."""
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with replaced(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [field.name for field in fields(Score)])
         writer.writeheader()
         writer.writerows(asdict(score) for score in scores)
 
 
 def load_scores(path: Path) -> list[Score]:
-    """Reads what ``save_scores`` wrote; nothing where there is no such file."""
+    """Reads what ``save_scores`` wrote; nothing where there is no such file.
+
+    Raises:
+        ValueError: the file is damaged; the message names the line.
+    """
     if not path.exists():
         return []
     kinds = get_type_hints(Score)
     readers = {name: {int: int, float: float}.get(kind, str) for name, kind in kinds.items()}
-    with path.open(newline="", encoding="utf-8") as file:
-        return [Score(**{name: readers[name](value) for name, value in row.items()}) for row in csv.DictReader(file)]
+    scores: list[Score] = []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                if set(row) != set(readers) or None in row.values():
+                    raise ValueError("its columns are not those of a score")
+                scores.append(Score(**{name: readers[name](value) for name, value in row.items()}))
+                find_trial(scores[-1].trial)
+    except ValueError as error:
+        line = len(scores) + 2
+        raise ValueError(f"{path} cannot be read (line {line}: {error}); mend or delete it, or measure anew.") from error
+    return scores
+
+
+def save_settings(path: Path, settings: Settings) -> None:
+    """Writes the settings as JSON."""
+    path.write_text(json.dumps(asdict(settings), indent=1), encoding="utf-8")
+
+
+def load_settings(path: Path) -> Settings:
+    """Reads what ``save_settings`` wrote.
+
+    Raises:
+        ValueError: there is no such file, or it is damaged.
+    """
+    if not path.exists():
+        raise ValueError(f"There are no results in {path.parent}: measure first.")
+    try:
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        given: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in kept.items()}
+        return Settings(**{**given, "fit": FitOptions(**kept["fit"])})
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"{path} cannot be read ({error}); measure anew without --resume.") from error

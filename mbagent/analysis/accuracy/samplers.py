@@ -46,6 +46,9 @@ class FitOptions:
         real_guess: start from the predictor's probabilities, as step 2 reads, rather than from bits drawn from them.
         rounding: "2d^2+1" hidden nodes in d groups: "down" is 2d a group, "up" 2d + 1.
         widening: as many times the paper's hidden nodes.
+
+    Raises:
+        ValueError: an option is out of range.
     """
 
     iterations: int = 250
@@ -58,6 +61,16 @@ class FitOptions:
     real_guess: bool = False
     rounding: Literal["down", "up"] = "down"
     widening: int = 1
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        for name in ("iterations", "updates", "sweeps", "widening"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"fit.{name} must be at least 1, got {getattr(self, name)}.")
+        if not 0.0 < self.learning_rate < float("inf"):
+            raise ValueError(f"fit.learning_rate must be a finite number above 0, got {self.learning_rate:g}.")
+        if not 0.0 <= self.memory < 1.0:
+            raise ValueError(f"fit.memory must lie in [0, 1), got {self.memory:g}.")
 
 
 def paper_config(d: int, n: int, options: FitOptions) -> NeuralConfig:

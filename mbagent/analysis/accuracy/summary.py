@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from mbagent.analysis.accuracy.experiment import FEW_ITERATIONS
 from mbagent.analysis.accuracy.samplers import CAUSAL, COMBINED, PREDICTOR
@@ -57,12 +59,12 @@ class Statement:
     Attributes:
         text: the conclusion.
         evidence: the figures it is judged by.
-        holds: whether they bear it out.
+        holds: whether they bear it out; None where an interval leaves it open, or a figure is undefined.
     """
 
     text: str
     evidence: str
-    holds: bool
+    holds: bool | None
 
 
 def cell(values: Iterable[float]) -> Cell:
@@ -178,48 +180,81 @@ def _gain(scores: Sequence[Score], trial: str) -> np.ndarray:
 def _better_than_alone(scores: Sequence[Score]) -> Statement:
     gains = {trial.name: _gain(scores, trial.name) for trial in TRIALS if any(s.trial == trial.name for s in scores)}
     cells = {name: mean_interval(gain) for name, gain in gains.items()}
-    text = "; ".join(f"{name} {c.estimate:+.3f} [{c.low:+.3f}, {c.high:+.3f}]" for name, c in cells.items())
-    holds = all(c.estimate > 0.0 for c in cells.values())
-    return Statement("The combined sampler is always superior to the predictor alone", f"gain in correlation: {text}", holds)
+    text = "; ".join(f"{name} {_signed(c)}" for name, c in cells.items())
+    return Statement(
+        "The combined sampler is always superior to the predictor alone",
+        f"gain in correlation: {text}",
+        _all([_above_zero(c) for c in cells.values()]),
+    )
 
 
 def _milder_without_correlation(scores: Sequence[Score]) -> Statement:
-    low, high = float(np.nanmean(_gain(scores, "1a"))), float(np.nanmean(_gain(scores, "1b")))
-    text = f"gain {low:+.3f} in 1a (uncorrelated), {high:+.3f} in 1b (correlated)"
-    return Statement("Without correlation between variables the difference is milder", text, low < high)
+    low, high = _gain(scores, "1a"), _gain(scores, "1b")
+    text = f"gain {_signed(mean_interval(low))} in 1a (uncorrelated), {_signed(mean_interval(high))} in 1b (correlated)"
+    return Statement("Without correlation between variables the difference is milder", text, _greater(high, low))
 
 
 def _falls(scores: Sequence[Score], trials: tuple[str, ...], text: str) -> Statement:
-    means = [float(np.nanmean(_values(scores, trial, COMBINED, _union))) for trial in trials]
-    wrong = [float(np.nanmean(_values(scores, trial, COMBINED, lambda s: s.variation))) for trial in trials]
+    values = [_values(scores, trial, COMBINED, _union) for trial in trials]
+    wrong = [mean_interval(_values(scores, trial, COMBINED, lambda s: s.variation)).estimate for trial in trials]
     pairs = ", ".join(
-        f"{trial}: correlation {mean:.3f}, total variation {tv:.3f}" for trial, mean, tv in zip(trials, means, wrong, strict=True)
+        f"{trial}: correlation {mean_interval(v).estimate:.3f}, total variation {tv:.3f}"
+        for trial, v, tv in zip(trials, values, wrong, strict=True)
     )
-    return Statement(text, pairs, means == sorted(means, reverse=True))
+    return Statement(text, pairs, _all([_greater(first, second) for first, second in itertools.pairwise(values)]))
 
 
 def _zeros_and_ones(scores: Sequence[Score]) -> list[Statement]:
     early = f"{COMBINED}, {FEW_ITERATIONS} iterations"
-    figures = {}
-    for name, field in (("zero", "at_zero"), ("one", "at_one")):
-        for sampler in (early, COMBINED):
-            chosen = [getattr(s, field) for s in scores if s.sampler == sampler and s.draws == "many"]
-            figures[name, sampler] = mean_interval(chosen).estimate
-    zero, one = figures["zero", COMBINED], figures["one", COMBINED]
-    mass = {
-        sampler: mean_interval(1.0 - s.valid for s in scores if s.sampler == sampler and s.draws == "many").estimate
-        for sampler in (early, COMBINED)
+    chosen = {
+        name: [s for s in scores if (s.sampler, s.draws) == (sampler, "many")]
+        for name, sampler in (("early", early), ("late", COMBINED))
     }
+    zero, one = (mean_interval(getattr(s, field) for s in chosen["late"]) for field in ("at_zero", "at_one"))
+    one_early = mean_interval(s.at_one for s in chosen["early"]).estimate
+    mass = {name: np.array([1.0 - s.valid for s in group]) for name, group in chosen.items()}
+    means = {name: mean_interval(values).estimate for name, values in mass.items()}
+    below_one = _above_zero(mean_interval(1.0 - s.at_one for s in chosen["late"]))
     return [
         Statement(
             "Transitions with observed probability zero are overestimated, those with probability one underestimated",
-            f"mean estimate {zero:.4f} where zero was observed, {one:.3f} where one was",
-            zero > 0.0 and not one >= 1.0,
+            f"mean estimate {zero.estimate:.5f} over all outcomes never observed (d up to 8), {one.estimate:.3f} where only "
+            "one was ever observed",
+            _all([_above_zero(zero), below_one]),
         ),
         Statement(
             "More training pushes the estimates closer to the frequencies",
-            f"mass on outcomes never observed: {mass[early]:.3f} after {FEW_ITERATIONS} iterations, {mass[COMBINED]:.3f} at the "
-            f"end; estimate where one was observed: {figures['one', early]:.3f}, then {one:.3f}",
-            mass[COMBINED] < mass[early],
+            f"mass on outcomes never observed: {means['early']:.3f} after {FEW_ITERATIONS} iterations, {means['late']:.3f} at "
+            f"the end; estimate where only one was observed: {one_early:.3f}, then {one.estimate:.3f}",
+            _greater(mass["early"], mass["late"]),
         ),
     ]
+
+
+def _signed(interval: Interval) -> str:
+    ends = "" if np.isnan(interval.low) else f" [{interval.low:+.3f}, {interval.high:+.3f}]"
+    return f"{interval.estimate:+.3f}{ends}"
+
+
+def _above_zero(interval: Interval) -> bool | None:
+    """Whether a mean is above zero; None where its interval does not tell."""
+    if interval.high <= 0.0:
+        return False
+    return True if interval.low > 0.0 else None
+
+
+def _greater(first: np.ndarray, second: np.ndarray) -> bool | None:
+    """Whether one mean is above another, by Welch's test at 5%; None where it does not tell."""
+    first, second = (values[~np.isnan(values)] for values in (first, second))
+    if min(len(first), len(second)) < 2 or np.ptp(first) + np.ptp(second) == 0.0:
+        return None
+    if stats.ttest_ind(first, second, equal_var=False).pvalue >= 0.05:
+        return None
+    return bool(first.mean() > second.mean())
+
+
+def _all(held: Sequence[bool | None]) -> bool | None:
+    """Whether all hold; None where none fails and some are open."""
+    if any(one is False for one in held):
+        return False
+    return None if None in held else True

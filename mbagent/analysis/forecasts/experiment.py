@@ -18,7 +18,7 @@ import mbagent
 from mbagent.analysis.forecasts import measures as m
 from mbagent.models.base import Actions, Keys, States
 from mbagent.models.factory import build_direct
-from mbagent.models.forecasts import DirectForecastModel, iterate, random_strings
+from mbagent.models.forecasts import DirectForecastModel, iterate, longest_string, random_strings
 from mbagent.models.simulator import SimulatorModel
 from mbagent.spaces import ActionEnumeration, FactoredSpace
 from mbagent_envs.random_keys import derive
@@ -85,10 +85,26 @@ class Settings:
         names = [case.name for case in CASES]
         for name in self.cases:
             if name not in names:
-                raise ValueError(f"There is no game {name!r}; choose from {', '.join(names)}.")
+                raise ValueError(f"There is no game {name!r}; choose from {', '.join(map(repr, names))}.")
+        if not self.cases:
+            raise ValueError(f"There is nothing to measure: name at least one game of {', '.join(map(repr, names))}.")
+        for case in (case for case in CASES if case.name in self.cases):
+            n_actions = ActionEnumeration(case.make().action_space).n
+            if self.steps and max(self.steps) > longest_string(n_actions):
+                raise ValueError(
+                    f"{case.name} has {n_actions} actions: forecasts reach at most {longest_string(n_actions)} steps ahead, "
+                    f"got {max(self.steps)}."
+                )
         if not self.steps or min(self.steps) < 1:
             raise ValueError(f"Forecasts reach n = 1, 2, ... steps ahead, got {list(self.steps)}.")
-        for field, least in (("timesteps", 100), ("seeds", 1), ("n_starts", 1), ("n_draws", 2), ("episodes", 0)):
+        for field, least in (
+            ("timesteps", 100),
+            ("seeds", 1),
+            ("n_starts", 1),
+            ("n_draws", 2),
+            ("episodes", 0),
+            ("first_seed", 0),
+        ):
             if getattr(self, field) < least:
                 raise ValueError(f"{field} must be at least {least}, got {getattr(self, field)}.")
 
@@ -220,7 +236,7 @@ def _joints(
     result: dict[tuple[Method, int], float] = {}
     for n in steps:
         truth, iterated = m.follow(exact, starts, strings[:, :n]), m.follow(learned, starts, strings[:, :n])
-        direct = m.direct_distribution(model, states, starts, strings[:, :n]) if n in model.direct else iterated
+        direct = m.direct_distribution(model, states, starts, strings[:, :n]) if n in model.known else iterated
         result["iterated", n], result["direct", n] = m.joint_variation(iterated, truth), m.joint_variation(direct, truth)
         result["true again", n] = 0.0
     return result

@@ -100,6 +100,10 @@ def test_a_measure_is_used_only_where_it_exists_for_every_score() -> None:
         (["--games", "Chess"], "no game 'Chess'"),
         (["--timesteps", "0"], "timesteps must be at least 100"),
         (["--n-draws", "1"], "n_draws must be at least 2"),
+        (["--games"], "name at least one game"),
+        (["--steps", "1", "100"], "at most 39 steps ahead"),
+        (["--first-seed", "-1"], "first_seed must be at least 0"),
+        (["--workers", "0"], "at least 1 process"),
     ],
 )
 def test_mistakes_get_one_sentence(wrong: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
