@@ -8,6 +8,7 @@ from dataclasses import replace
 from mbagent.models.base import BaseTransitionModel, TransitionModel
 from mbagent.models.config import NeuralConfig
 from mbagent.models.forecasts import DirectForecastModel, longest_string
+from mbagent.models.graphs import DecisionGraphModel
 from mbagent.models.neural import NeuralTransitionModel
 from mbagent.models.plane_strings import PlaneStringPredictor
 from mbagent.models.planes import PlanePredictor
@@ -94,11 +95,18 @@ def build_tabular(space: FactoredSpace, n_actions: int, learning_rate: float) ->
     return TabularModel(space.cardinalities, n_actions)
 
 
+def build_graphs(space: FactoredSpace, n_actions: int, learning_rate: float) -> TransitionModel:
+    """Decision graphs over the few columns that each variable hangs on, found from data."""
+    del learning_rate
+    return DecisionGraphModel(space.cardinalities, n_actions)
+
+
 _FACTORIES: dict[str, ModelFactory] = {
     "auto": build_auto,
     "paper": build_paper,
     "tabular": build_tabular,
     "direct": build_direct,
+    "graphs": build_graphs,
 }
 
 

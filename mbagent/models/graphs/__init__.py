@@ -1,0 +1,5 @@
+"""Structure found in data: bits that exclude each other, rare events, and what each variable hangs on."""
+
+from mbagent.models.graphs.model import DecisionGraphModel
+
+__all__ = ["DecisionGraphModel"]

@@ -1,0 +1,82 @@
+"""Decision graphs to and from plain arrays; what comes from a file is checked, since compiled kernels check nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.graphs.compiled import Graphs
+from mbagent.models.graphs.units import Layout
+
+_FLOATS = ("rate", "spread", "stays", "novelty", "base", "still")
+
+
+def to_arrays(graphs: Graphs) -> dict[str, NDArray[Any]]:
+    """The graphs' arrays by name."""
+    return {name: array.copy() for name, array in graphs._asdict().items()}
+
+
+def from_arrays(arrays: Mapping[str, NDArray[Any]], layout: Layout) -> Graphs:
+    """The graphs that ``to_arrays`` took apart.
+
+    Raises:
+        ValueError: they are no graphs of these units.
+    """
+    missing = sorted(set(Graphs._fields) ^ set(arrays))
+    if missing:
+        raise ValueError(f"These weights are no decision graphs (first difference: {missing[0]!r}).")
+    kinds = {name: np.float64 if name in _FLOATS else np.int64 for name in Graphs._fields}
+    flat: dict[str, Any] = {name: np.ascontiguousarray(array, dtype=kinds[name]).reshape(-1) for name, array in arrays.items()}
+    graphs = Graphs(**flat)
+    if not _sound(graphs, layout):
+        raise ValueError("These weights are no decision graphs of these units; load them into a model of the same environment.")
+    return graphs
+
+
+def _sound(graphs: Graphs, layout: Layout) -> bool:
+    """Whether every index leads somewhere and no path is endless."""
+    n_units, n_nodes, n_entries = len(layout.outputs), len(graphs.column), len(graphs.values)
+    pairs = np.concatenate([[0], np.cumsum(layout.n_actions * layout.outputs)])
+    start = np.concatenate([[0], np.cumsum(layout.outputs)])
+    if not (np.array_equal(graphs.pairs, pairs) and np.array_equal(graphs.start, start)):
+        return False
+    lengths = {
+        "off": n_nodes,
+        "on": n_nodes,
+        "rate": n_nodes,
+        "spread": n_nodes,
+        "nodes": n_entries,
+        "entries": pairs[-1] + 1,
+        "stays": pairs[-1],
+        "novelty": pairs[-1],
+        "base": start[-1],
+        "still": 1,
+    }
+    if any(len(getattr(graphs, name)) != length for name, length in lengths.items()):
+        return False
+    asks, numbers = graphs.column >= 0, np.arange(n_nodes)
+    return bool(
+        _within(graphs.changing, n_units)
+        and _within(graphs.column + 1, len(layout.factor) + layout.n_actions + 1)
+        and _within(graphs.nodes, n_nodes)
+        and (np.diff(graphs.entries) >= 0).all()
+        and (graphs.entries[0], graphs.entries[-1]) == (0, n_entries)
+        and ((graphs.off >= 0) & (graphs.off < numbers))[asks].all()
+        and ((graphs.on >= 0) & (graphs.on < numbers))[asks].all()
+        and _values_fit(graphs, layout)
+        and all(np.isfinite(getattr(graphs, name)).all() for name in _FLOATS)
+    )
+
+
+def _values_fit(graphs: Graphs, layout: Layout) -> bool:
+    """Whether each entry's value is one that its unit has."""
+    pair = np.repeat(np.arange(len(graphs.entries) - 1), np.diff(graphs.entries))
+    unit = np.searchsorted(graphs.pairs, pair, side="right") - 1
+    return bool(((graphs.values >= 0) & (graphs.values < layout.outputs[unit])).all())
+
+
+def _within(values: NDArray[np.int64], n: int) -> bool:
+    return bool(((values >= 0) & (values < n)).all())

@@ -1,0 +1,297 @@
+"""Decision graphs as flat arrays: nodes ask for a column, contexts with equal rates share a leaf.
+
+After Chickering, Heckerman and Meek 1997, "A Bayesian approach to learning Bayesian networks with local structure".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mbagent.models.graphs.search import Search
+from mbagent.models.graphs.units import Layout, Question
+from mbagent_envs._compiled import compiled
+
+Floats: TypeAlias = NDArray[np.float64]
+Ints: TypeAlias = NDArray[np.int64]
+Bools: TypeAlias = NDArray[np.bool_]
+
+SURE = 0.02
+"""Typical rates are taken to lie this far from 0 and 1 at least."""
+
+
+THETAS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0, 1000.0)
+"""Parameters of Ewens' formula to choose from."""
+
+
+class Graphs(NamedTuple):
+    """The graphs of all units.
+
+    Attributes:
+        changing: units that have graphs, int64.
+        pairs: where the pairs (action, value) of each unit begin, int64 [U + 1]; pair ``action * cardinality + value``.
+        entries: where the entries of each pair begin, int64 [pairs + 1].
+        values: the value that an entry is about, int64 [E].
+        nodes: its first node, int64 [E].
+        column: what a node asks for, -1 at a leaf, int64 [nodes].
+        off, on: next node, int64 [nodes].
+        rate: probability at a leaf, [nodes].
+        spread: standard error of a leaf's rate, 0 where all its rows agree, [nodes].
+        stays: share of a pair's rows in which the unit kept its value, [pairs]; 1 where there are none.
+        novelty: probability that what follows a pair is none of what was seen to follow it, [pairs].
+        base: where the novelties of each unit are drawn from, after ``start`` [U + 1], [sum of cardinalities].
+        still: probability that a unit without graphs changes, [1].
+    """
+
+    changing: Ints
+    pairs: Ints
+    entries: Ints
+    values: Ints
+    nodes: Ints
+    column: Ints
+    off: Ints
+    on: Ints
+    rate: Floats
+    spread: Floats
+    stays: Floats
+    novelty: Floats
+    start: Ints
+    base: Floats
+    still: Floats
+
+
+class _Nodes:
+    """Nodes of all graphs while they are built."""
+
+    def __init__(self) -> None:
+        self.links: list[tuple[int, int, int]] = []
+        self.rates: list[tuple[float, float]] = []
+
+    def add(self, column: int, off: int, on: int, rate: float = 0.0, spread: float = 0.0) -> int:
+        self.links.append((column, off, on))
+        self.rates.append((rate, spread))
+        return len(self.links) - 1
+
+    def graph(self, search: Search, prior: LeafPrior) -> Ints:
+        """Adds a head's graph; returns the first node of each of its first contexts."""
+        n, e = search.counts()
+        rates = prior.rates(n, e, search.typical)
+        spreads = np.sqrt(e * (n - e) / np.maximum(n, 1) ** 3)
+        level = [self.add(-1, 0, 0, float(rate), float(spread)) for rate, spread in zip(rates, spreads, strict=True)]
+        for split in reversed(search.splits):
+            level = [
+                level[off] if level[off] == level[on] else self.add(split.column, level[off], level[on])
+                for off, on in zip(split.off, split.on, strict=True)
+            ]
+        return np.asarray(level, dtype=np.int64)
+
+
+class LeafPrior(NamedTuple):
+    """What is believed of a leaf's rate before its rows are seen: a spike at 0 and 1, and a slab around the typical rate.
+
+    Attributes:
+        certain: probability that nothing about the leaf is random.
+        strength: rows that the typical rate counts for otherwise.
+    """
+
+    certain: float
+    strength: float
+
+    def evidence(self, n: Ints, e: Ints, typical: Floats) -> tuple[Floats, Floats]:
+        """Log-probability of ``e`` of ``n`` rows, in their order, and the posterior probability of the slab."""
+        up, down = self.strength * typical, self.strength * (1.0 - typical)
+        slab = special.betaln(up + e, down + n - e) - special.betaln(up, down) + np.log1p(-self.certain)
+        with np.errstate(divide="ignore"):
+            spike = np.log(self.certain * ((e == 0) * (1.0 - typical) + ((e == n) & (n > 0)) * typical))
+        total = np.logaddexp(slab, spike)
+        return total, np.exp(slab - total)
+
+    def rates(self, n: Ints, e: Ints, typical: Floats) -> Floats:
+        """Posterior mean rate."""
+        typical = typical.clip(SURE, 1.0 - SURE)
+        _, slab = self.evidence(n, e, typical)
+        spike = np.where(n == 0, typical, (e == n) * 1.0)
+        result: Floats = slab * (e + self.strength * typical) / (n + self.strength) + (1.0 - slab) * spike
+        return result
+
+
+def best_prior(searches: Sequence[Search]) -> LeafPrior:
+    """The prior under which the leaves found are likeliest."""
+    counts = [search.counts() for search in searches]
+    if not counts:
+        return PRIORS[0]
+    n, e = (np.concatenate([pair[i] for pair in counts]) for i in (0, 1))
+    typical = np.concatenate([search.typical for search in searches]).clip(SURE, 1.0 - SURE)
+    return max(PRIORS, key=lambda prior: float(prior.evidence(n, e, typical)[0].sum()))
+
+
+PRIORS = tuple(
+    LeafPrior(certain, strength) for certain in (0.1, 0.5, 0.8, 0.9, 0.99, 0.999, 0.9999) for strength in (0.3, 1.0, 3.0, 10.0)
+)
+"""Priors of leaves to choose from."""
+
+
+def build(layout: Layout, asked: Sequence[Question], found: Sequence[Search], habits: Sequence[Habit], still: float) -> Graphs:
+    """All graphs.
+
+    Args:
+        layout: the units.
+        asked: the questions.
+        found: what was found for each.
+        habits: of each unit.
+        still: probability that a unit without graphs changes.
+    """
+    nodes, prior = _Nodes(), best_prior(found)
+    pairs = np.concatenate([[0], np.cumsum(layout.n_actions * layout.outputs)]).astype(np.int64)
+    entries: list[tuple[int, int, int]] = []
+    for question, search in zip(asked, found, strict=True):
+        first = nodes.graph(search, prior)
+        entries += [
+            (int(pairs[question.unit] + pair), question.value, int(node))
+            for pair, node in zip(question.pairs, first, strict=True)
+        ]
+    table = np.asarray(sorted(entries), dtype=np.int64).reshape(-1, 3)
+    links = np.asarray(nodes.links, dtype=np.int64).reshape(-1, 3)
+    rates = np.asarray(nodes.rates, dtype=np.float64).reshape(-1, 2)
+    return Graphs(
+        np.asarray(sorted({question.unit for question in asked}), dtype=np.int64),
+        pairs,
+        np.searchsorted(table[:, 0], np.arange(pairs[-1] + 1)).astype(np.int64),
+        np.ascontiguousarray(table[:, 1]),
+        np.ascontiguousarray(table[:, 2]),
+        np.ascontiguousarray(links[:, 0]),
+        np.ascontiguousarray(links[:, 1]),
+        np.ascontiguousarray(links[:, 2]),
+        np.ascontiguousarray(rates[:, 0]),
+        np.ascontiguousarray(rates[:, 1]),
+        np.concatenate([habit.stays for habit in habits]),
+        np.concatenate([habit.novelty for habit in habits]),
+        np.concatenate([[0], np.cumsum(layout.outputs)]).astype(np.int64),
+        np.concatenate([habit.base for habit in habits]),
+        np.asarray([still]),
+    )
+
+
+@dataclass(frozen=True)
+class Habit:
+    """What a unit does after each pair (action, value), whatever else is the case.
+
+    Attributes:
+        stays: share of a pair's rows in which the unit kept its value, [pairs]; 1 where there are none.
+        novelty: probability that it does what it never did after that pair, [pairs]; where there are no
+            rows, as after one.
+        base: how often each value came anew, [cardinality], summing to one.
+    """
+
+    stays: Floats
+    novelty: Floats
+    base: Floats
+
+
+def habit_of(cardinality: int, n_actions: int, actions: Ints, now: Ints, then: Ints) -> Habit:
+    """A unit's habit in N rows.
+
+    Novelty falls with the rows seen as in Ewens' sampling formula, theta / (rows + theta), with the theta under which what
+    followed each pair is foretold best, each row from the others: large where anything may follow, next to nothing
+    where the same things follow again and again.
+    """
+    size = n_actions * cardinality
+    counts = np.zeros((size, cardinality))
+    pair = actions * cardinality + now
+    np.add.at(counts, (pair, then), 1.0)
+    visits = counts.sum(axis=1)
+    stayed = counts[np.arange(size), np.arange(size) % cardinality]
+    stays = np.where(visits > 0, stayed / np.maximum(visits, 1), 1.0)
+    anew = np.bincount(then[now != then], minlength=cardinality) + 0.5
+    base = anew / anew.sum()
+    if cardinality == 2 or len(pair) == 0:
+        return Habit(stays, np.zeros(size), base)
+    seen, value = np.nonzero(counts)
+    n, c = visits[seen], counts[seen, value]
+
+    def foretold(theta: float) -> float:
+        again = np.where(c > 1, np.log(np.maximum(c - 1, 1)), np.log(theta * base[value]))
+        return float((c * (again - np.log(n - 1 + theta))).sum())
+
+    theta = max(THETAS, key=foretold)
+    return Habit(stays, theta / (np.maximum(visits, 1.0) + theta), base)
+
+
+@compiled
+def read(state: Ints, unit: int, layout: Layout) -> int:
+    """Value of a unit in a state [F]; 0 for ``terminated`` and the event."""
+    first, last = layout.first[unit], layout.first[unit + 1]
+    if last - first == 1:
+        return int(state[layout.members[first]])
+    for member in range(first, last):
+        if state[layout.members[member]] == 1:
+            return int(member - first)
+    return 0
+
+
+@compiled
+def write(state: Ints, unit: int, value: int, layout: Layout) -> None:
+    """Sets a unit's value in a state [F] in which it has the value that ``read`` gives."""
+    first, last = layout.first[unit], layout.first[unit + 1]
+    if last - first == 1:
+        state[layout.members[first]] = value
+    elif last > first:
+        state[layout.members[first + read(state, unit, layout)]] = 0
+        state[layout.members[first + value]] = 1
+
+
+@compiled
+def show(state: Ints, action: int, layout: Layout, on: Bools) -> None:
+    """Writes which columns are on to ``on`` [D]."""
+    n = len(layout.factor)
+    for column in range(n):
+        on[column] = state[layout.factor[column]] == layout.value[column]
+    for other in range(layout.n_actions):
+        on[n + other] = other == action
+
+
+@compiled
+def _leaf(node: int, graphs: Graphs, on: Bools) -> int:
+    while graphs.column[node] >= 0:
+        node = graphs.on[node] if on[graphs.column[node]] else graphs.off[node]
+    return node
+
+
+@compiled
+def distribution(unit: int, value: int, action: int, layout: Layout, graphs: Graphs, on: Bools, out: Floats) -> None:
+    """Writes the distribution of a unit that is at ``value`` to ``out`` [its cardinality].
+
+    The graphs give the rates of all values but the present one, which has the rest. Where the unit was never seen to stay,
+    the rest is taken for an error of estimation unless it is larger than such an error can be.
+    """
+    n = layout.outputs[unit]
+    pair = graphs.pairs[unit] + action * n + value
+    begin, end = graphs.entries[pair], graphs.entries[pair + 1]
+    if n == 2:
+        rate = graphs.still[0] if value == 0 else 1.0 - graphs.still[0]
+        if begin < end:
+            rate = graphs.rate[_leaf(graphs.nodes[begin], graphs, on)]
+        out[0], out[1] = 1.0 - rate, rate
+        return
+    for k in range(n):
+        out[k] = 0.0
+    total, slack = 0.0, 0.0
+    for entry in range(begin, end):
+        leaf = _leaf(graphs.nodes[entry], graphs, on)
+        out[graphs.values[entry]] = graphs.rate[leaf]
+        total += graphs.rate[leaf]
+        slack += 3.0 * graphs.spread[leaf]
+    stay = 1.0 - total
+    if begin < end:
+        stays = graphs.stays[pair]
+        stay = max(0.0, stay - slack) if stays == 0.0 else max(stay, min(slack, stays))
+    out[value] = stay
+    novelty = graphs.novelty[pair]
+    scale = (1.0 - novelty) / (total + stay)
+    for k in range(n):
+        out[k] = out[k] * scale + novelty * graphs.base[graphs.start[unit] + k]

@@ -1,0 +1,260 @@
+"""Transitions as decision graphs: which few things each variable hangs on, found from data by Bayesian evidence."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.base import (
+    Actions,
+    BaseTransitionModel,
+    Bools,
+    FitReport,
+    Floats,
+    Keys,
+    Randomness,
+    States,
+    Successors,
+    as_keys,
+)
+from mbagent.models.graphs import draws
+from mbagent.models.graphs.arrays import from_arrays, to_arrays
+from mbagent.models.graphs.compiled import Graphs, build, habit_of
+from mbagent.models.graphs.events import flag_events
+from mbagent.models.graphs.fitting import Fitted, fit_graphs
+from mbagent.models.graphs.units import lay_out
+from mbagent.models.particles import assemble, rows_at_once, start
+from mbagent.transitions import TransitionBatch, TransitionDataset
+from mbagent_envs.random_keys import derive, uniforms
+
+IMPOSSIBLE = -200.0
+"""Log-probability that an impossible transition is charged with when models are compared."""
+
+_EVENT = 1 << 33
+"""Salt of the random number that decides whether the event happens."""
+
+
+class DecisionGraphModel(BaseTransitionModel):
+    """Each variable's next value by a small decision graph over the few columns that it hangs on.
+
+    Bits of which exactly one is on are drawn as one variable. Rare events that redraw almost everything have graphs of
+    their own, and one for whether they happen. All probabilities are exact; a fit takes well under a second.
+
+    Args:
+        cardinalities: number of values of each state factor, length F.
+        n_actions: number of enumerated actions A.
+        validation: share of episodes held out, for the report and for the choice whether there are rare events; the
+            graphs are fitted to all rows in the end.
+    """
+
+    def __init__(self, cardinalities: tuple[int, ...], n_actions: int, validation: float = 0.1) -> None:
+        """See the class."""
+        super().__init__(cardinalities, n_actions)
+        self.validation = validation
+        layout = lay_out(self.cardinalities, (), n_actions)
+        none = np.zeros(0, dtype=np.int64)
+        nothing = build(layout, (), (), [habit_of(int(n), n_actions, none, none, none) for n in layout.outputs], 1e-9)
+        self.fitted = Fitted(layout, nothing, nothing, False, (), ())
+
+    def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
+        """See TransitionModel."""
+        began = time.perf_counter()
+        train, held_out = data.split(self.validation, seed)
+        rows = data.rows()
+        events = flag_events(rows.states, rows.next_states)
+        plain = self._fitted(train, np.zeros(len(train), dtype=np.bool_))
+        best, likelihood = plain, self._likelihood(plain, held_out)
+        if progress is not None:
+            progress(0.4)
+        if events.any():
+            flagged = self._fitted(train, flag_events(train.states, train.next_states))
+            other = self._likelihood(flagged, held_out)
+            if other > likelihood:
+                best, likelihood = flagged, other
+            else:
+                events[:] = False
+        if progress is not None:
+            progress(0.7)
+        self.fitted = best
+        exact = self._exact_match(held_out)
+        self.fitted = self._fitted(rows, events)
+        if progress is not None:
+            progress(1.0)
+        splits = [sum(split.column >= 0 for split in search.splits) for search in self.fitted.found]
+        return FitReport(
+            n_train=len(rows),
+            n_validation=len(held_out),
+            epochs=1,
+            seconds=time.perf_counter() - began,
+            predictor_loss=-likelihood,
+            exact_match=exact,
+            log={
+                "questions": float(len(splits)),
+                "splits": float(np.mean(splits)) if splits else 0.0,
+                "nodes": float(len(self.fitted.usual.column)),
+                "events": float(events.sum()),
+            },
+        )
+
+    def _fitted(self, rows: TransitionBatch, events: Bools) -> Fitted:
+        return fit_graphs(self.cardinalities, self.n_actions, rows, events)
+
+    def _likelihood(self, fitted: Fitted, rows: TransitionBatch) -> float:
+        """Mean log-probability of transitions; the impossible counts as ``IMPOSSIBLE``."""
+        before, self.fitted = self.fitted, fitted
+        logs = self.log_prob(rows.states, rows.actions, rows.next_states, rows.terminated)
+        self.fitted = before
+        return float(np.maximum(logs, IMPOSSIBLE).mean()) if len(logs) else 0.0
+
+    def _exact_match(self, rows: TransitionBatch) -> float:
+        states, terminated = self.likeliest(rows.states, rows.actions)
+        hit = (states == rows.next_states).all(axis=1) & (terminated == rows.terminated)
+        return float(hit.mean()) if len(hit) else 1.0
+
+    def _rows(self, states: States, actions: Actions) -> tuple[States, Actions]:
+        states, actions = np.ascontiguousarray(states, dtype=np.int64), np.ascontiguousarray(actions, dtype=np.int64)
+        if states.ndim != 2 or states.shape[1] != len(self.cardinalities) or actions.shape != (len(states),):
+            raise ValueError(
+                f"A model of {len(self.cardinalities)} factors needs states [B, {len(self.cardinalities)}] and actions [B], "
+                f"got shapes {states.shape} and {actions.shape}."
+            )
+        return states, actions
+
+    def _event_rates(self, states: States, actions: Actions) -> Floats:
+        if not self.fitted.has_event:
+            return np.zeros(len(states))
+        rates: Floats = draws.event_rates(states, actions, self.fitted.layout, self.fitted.usual)
+        return rates
+
+    def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
+        """See TransitionModel."""
+        states, actions = self._rows(states, actions)
+        return self._draw(states, actions, as_keys(rng, len(states)))
+
+    def _draw(self, states: States, actions: Actions, keys: Keys) -> tuple[States, Bools]:
+        fitted, following, over = self.fitted, states.copy(), np.zeros(len(states), dtype=np.bool_)
+        draws.sample(states, actions, keys, fitted.layout, fitted.usual, following, over)
+        if fitted.has_event:
+            happens = np.flatnonzero(uniforms(derive(keys, _EVENT), 1)[:, 0] < self._event_rates(states, actions))
+            if len(happens):
+                given = states[happens]
+                redrawn, ends = given.copy(), np.zeros(len(happens), dtype=np.bool_)
+                draws.sample(given, actions[happens], keys[happens], fitted.layout, fitted.event, redrawn, ends)
+                following[happens], over[happens] = redrawn, ends
+        return following, over
+
+    def likeliest(self, states: States, actions: Actions) -> tuple[States, Bools]:
+        """The likeliest next states, unit by unit, int64 [B, F], and whether they end the episode, bool [B]."""
+        states, actions = self._rows(states, actions)
+        following, over = states.copy(), np.zeros(len(states), dtype=np.bool_)
+        draws.likeliest(states, actions, self.fitted.layout, self.fitted.usual, following, over)
+        happens = np.flatnonzero(self._event_rates(states, actions) > 0.5)
+        if len(happens):
+            given = states[happens]
+            redrawn, ends = given.copy(), np.zeros(len(happens), dtype=np.bool_)
+            draws.likeliest(given, actions[happens], self.fitted.layout, self.fitted.event, redrawn, ends)
+            following[happens], over[happens] = redrawn, ends
+        return following, over
+
+    def marginals(self, states: States, actions: Actions) -> Floats:
+        """See TransitionModel."""
+        states, actions = self._rows(states, actions)
+        start = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64)
+        fitted, probs = self.fitted, np.empty((len(states), int(start[-1])))
+        draws.marginals(states, actions, fitted.layout, fitted.usual, start, probs)
+        if fitted.has_event:
+            rate, redrawn = self._event_rates(states, actions)[:, None], np.empty_like(probs)
+            draws.marginals(states, actions, fitted.layout, fitted.event, start, redrawn)
+            probs += rate * (redrawn - probs)
+        return probs
+
+    def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
+        """See TransitionModel; exact for the distribution that ``sample`` draws from."""
+        states, actions = self._rows(states, actions)
+        following, over = np.ascontiguousarray(next_states, dtype=np.int64), np.ascontiguousarray(terminated, dtype=np.bool_)
+        layout = self.fitted.layout
+        usual: Floats = draws.log_prob(states, actions, following, over, layout, self.fitted.usual)
+        if not self.fitted.has_event:
+            return usual
+        rate = self._event_rates(states, actions)
+        event = draws.log_prob(states, actions, following, over, layout, self.fitted.event)
+        with np.errstate(divide="ignore"):
+            return np.logaddexp(np.log1p(-rate) + usual, np.log(rate) + event)
+
+    def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
+        """See TransitionModel; systematic draws, see ``models/systematic.py``."""
+        states, actions = self._rows(states, actions)
+        usual = self._successors(states, actions, self.fitted.usual, n_samples, seed)
+        rates = self._event_rates(states, actions)
+        happens = np.flatnonzero(rates >= 1.0 / n_samples)
+        if len(happens) == 0:
+            return usual
+        event = self._successors(states[happens], actions[happens], self.fitted.event, n_samples, seed)
+        return mixed(usual, event, happens, rates)
+
+    def _successors(self, states: States, actions: Actions, graphs: Graphs, n_samples: int, seed: int) -> Successors:
+        key, offset = start(seed)
+        n_outputs = states.shape[1] + 1
+        step = rows_at_once(n_samples, n_outputs)
+        parts = [
+            draws.successors(states[b : b + step], actions[b : b + step], self.fitted.layout, graphs, n_samples, key, offset)
+            for b in range(0, len(states), step)
+        ]
+        return assemble(parts, n_samples, n_outputs)
+
+    def state_dict(self) -> dict[str, NDArray[Any]]:
+        """See TransitionModel."""
+        fitted = self.fitted
+        layout, grouped = fitted.layout, np.flatnonzero(np.diff(fitted.layout.first) > 1)
+        groups = [(int(unit), int(f)) for unit in grouped for f in layout.members[layout.first[unit] : layout.first[unit + 1]]]
+        state: dict[str, NDArray[Any]] = {
+            "groups": np.asarray(groups, dtype=np.int64).reshape(-1, 2),
+            "has_event": np.asarray(fitted.has_event),
+        }
+        for name, graphs in (("usual", fitted.usual), ("event", fitted.event)):
+            state.update({f"{name}.{part}": array for part, array in to_arrays(graphs).items()})
+        return state
+
+    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """See TransitionModel.
+
+        Raises:
+            ValueError: the arrays are not those of a model of these factors and actions; nothing is changed then.
+        """
+        known = {"groups", "has_event", *(f"{name}.{part}" for name in ("usual", "event") for part in Graphs._fields)}
+        wrong = sorted(known ^ set(state))
+        if wrong:
+            raise ValueError(f"These weights are not those of a decision graph model (first difference: {wrong[0]!r}).")
+        pairs = np.asarray(state["groups"], dtype=np.int64).reshape(-1, 2)
+        groups = [tuple(int(f) for f in pairs[pairs[:, 0] == unit, 1]) for unit in np.unique(pairs[:, 0])]
+        members = pairs[:, 1]
+        bits = np.flatnonzero(np.asarray(self.cardinalities) == 2)
+        if len(np.unique(members)) < len(members) or not np.isin(members, bits).all() or any(len(g) < 2 for g in groups):
+            raise ValueError(
+                "These weights group other bits than this model has; load them into a model of the same environment."
+            )
+        layout = lay_out(self.cardinalities, groups, self.n_actions)
+        usual, event = (
+            from_arrays({part: state[f"{name}.{part}"] for part in Graphs._fields}, layout) for name in ("usual", "event")
+        )
+        self.fitted = Fitted(layout, usual, event, bool(state["has_event"]), (), ())
+
+
+def mixed(usual: Successors, event: Successors, happens: NDArray[np.int64], rates: Floats) -> Successors:
+    """Both kinds of successors; row ``happens[j]`` of ``usual`` is row j of ``event``, which has the share ``rates`` of it."""
+    rows = np.concatenate([usual.rows, happens[event.rows]])
+    share = rates.copy()
+    share[np.setdiff1d(np.arange(len(rates)), happens)] = 0.0
+    weights = np.concatenate([usual.probabilities * (1.0 - share)[usual.rows], event.probabilities * share[happens[event.rows]]])
+    kept = weights > 0.0
+    order = np.argsort(rows[kept], kind="stable")
+    index = np.flatnonzero(kept)[order]
+    states = np.concatenate([usual.states, event.states])[index]
+    terminated = np.concatenate([usual.terminated, event.terminated])[index]
+    counts = np.bincount(rows[index], minlength=len(rates))
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return Successors(offsets, states, terminated, weights[index])

@@ -1,0 +1,161 @@
+"""Causes that matter only together, such as a thing here *and* a thing there, or one bit *or else* another.
+
+No single column tells such rows apart, so the greedy search would never begin. All pairs of columns are tried at once: the
+counts of their four cells in a context are one matrix product.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.graphs.evidence import Floats, Head, Ints
+from mbagent.models.graphs.search import Bools, Pair, Search, Tables
+
+PATTERNS: tuple[tuple[bool, bool, bool, bool], ...] = (
+    (False, False, False, True),
+    (False, False, True, False),
+    (False, True, False, False),
+    (True, False, False, False),
+    (False, True, True, False),
+)
+"""Which of the cells (neither, second only, first only, both) are told apart from the others."""
+
+FEWEST = 20
+"""Rows that a context must have."""
+
+FIRST = 3.0
+"""Log prior odds against one more cause, before any was found."""
+
+LEAST = 1.0
+"""Least price of a cause, nats, however likely the prior makes it."""
+
+MOST_COLUMNS = 1500
+"""Pairs are looked for among so many columns at most."""
+
+MOST_CONTEXTS = 4
+"""Contexts of a head that pairs are looked for in, the most mixed ones."""
+
+
+class PairSearch:
+    """Looks for pairs of columns where single ones explain nothing more.
+
+    Args:
+        kinds: kind of each column, int64 [D].
+        table: columns of all rows, bool [N, D].
+        tables: see ``log_gamma_tables``.
+    """
+
+    def __init__(self, kinds: Ints, table: Bools, tables: Tables) -> None:
+        """See the class."""
+        self.kinds, self.table, self.tables = kinds, table, tables
+        self._seen: dict[int, int] = {}
+        self._found: list[Pair] = []
+
+    def divide(self, searches: Sequence[Search]) -> bool:
+        """One round over all heads that changed since the last; whether any pair was found."""
+        if self.table.shape[1] > MOST_COLUMNS:
+            return False
+        prior, found = self._prior(), False
+        for h, search in enumerate(searches):
+            if not search.open or self._seen.get(h) == len(search.splits):
+                continue
+            pairs = find_pairs(search.head, self._worth(search, float(prior.max())), self.table, prior, self.tables)
+            for pair in pairs:
+                search.divide_by_pair(pair, self.table)
+            self._found += pairs
+            found = found or bool(pairs)
+            self._seen[h] = len(search.splits) if not pairs else -1
+        return found
+
+    def _worth(self, search: Search, most: float) -> list[int]:
+        """Contexts whose rows are so mixed that a pair could pay its price, the most mixed first."""
+        one, two = self.tables
+        n, e = search.counts()
+        cost = -(one[e] + one[n - e] - two[n])
+        return [int(c) for c in np.argsort(-cost, kind="stable")[:MOST_CONTEXTS] if cost[c] > -most]
+
+    def _prior(self) -> Floats:
+        """Log prior odds of each pair of columns, [D, D]: pairs of a kind already found are likelier, of fresh columns most."""
+        n = len(self.kinds)
+        if len(self._found) < 3:
+            return np.full((n, n), -math.log(max(1.0, len(PATTERNS) * n * (n - 1) / 2)) - FIRST)
+        n_kinds = int(self.kinds.max()) + 1
+        share, used = np.full((n_kinds, n_kinds), 0.2 / n_kinds**2), np.zeros(n, dtype=np.bool_)
+        for pair in self._found:
+            k, m = self.kinds[pair.first], self.kinds[pair.second]
+            share[k, m] += 0.5
+            share[m, k] += 0.5
+            used[[pair.first, pair.second]] = True
+        fresh = np.bincount(self.kinds[~used], minlength=n_kinds).clip(1)
+        # Where some columns of one kind each had a partner of another kind, the next one has, too: only who it is has a price.
+        odds = np.log(share / share.sum() / np.maximum.outer(fresh, fresh))[self.kinds[:, None], self.kinds]
+        result: Floats = odds - LEAST - np.where(used[:, None] | used, 3.0, 0.0)
+        return result
+
+
+def find_pairs(head: Head, contexts: Sequence[int], table: Bools, prior: Floats, tables: tuple[Floats, Floats]) -> list[Pair]:
+    """The best pair, and after it further ones in the same context that have no column in common with those before.
+
+    Args:
+        head: the rows.
+        contexts: contexts to look in.
+        table: columns of all rows, bool [N, D].
+        prior: log prior odds of each pair of columns, [D, D].
+        tables: see ``log_gamma_tables``.
+    """
+    found: list[Pair] = []
+    for context in contexts:
+        rows = head.context == context
+        if rows.sum() >= FEWEST:
+            found += _in_context(context, table[head.rows[rows]], head.came[rows], prior, tables)
+    best = max(found, default=None)
+    return [] if best is None else [pair for pair in found if pair.context == best.context]
+
+
+def _in_context(context: int, table: Bools, came: Ints, prior: Floats, tables: tuple[Floats, Floats]) -> list[Pair]:
+    one, two = tables
+    on = table.astype(np.float32)
+    cells_n, cells_e = _cells(on, np.ones_like(came)), _cells(on, came)
+    n, e = len(came), int(came.sum())
+    best, which = np.full(prior.shape, -np.inf), np.zeros(prior.shape, dtype=np.int64)
+    for number, pattern in enumerate(PATTERNS):
+        inside_n, inside_e = _inside(cells_n, pattern), _inside(cells_e, pattern)
+        gain = _evidence(inside_e, inside_n, one, two) + _evidence(e - inside_e, n - inside_n, one, two)
+        which[gain > best] = number
+        np.maximum(best, gain, out=best)
+    best += np.triu(prior, 1) - (one[e] + one[n - e] - two[n])
+    best[np.tril_indices(len(best))] = -np.inf
+    pairs: list[Pair] = []
+    while best.size and (top := float(best.max())) > 0.0:
+        first, second = (int(i) for i in np.unravel_index(int(best.argmax()), best.shape))
+        pattern = PATTERNS[which[first, second]]
+        if pairs and (pattern != PATTERNS[0] or pairs[0].pattern != PATTERNS[0]):
+            break
+        pairs.append(Pair(top, context, first, second, pattern))
+        best[[first, second]] = best[:, [first, second]] = -np.inf
+    return pairs
+
+
+def _cells(on: NDArray[np.float32], weights: Ints) -> tuple[Ints, Ints, Ints, Ints]:
+    """Weight of the rows in which neither, the second only, the first only, both of two columns are on, int64 [D, D] each."""
+    both = np.rint((on * weights[:, None].astype(np.float32)).T @ on).astype(np.int64)
+    single = np.diag(both)
+    first, second = single[:, None] - both, single[None, :] - both
+    return int(weights.sum()) - both - first - second, second, first, both
+
+
+def _inside(cells: Sequence[Ints], pattern: Sequence[bool]) -> Ints:
+    total = np.zeros_like(cells[0])
+    for cell, chosen in zip(cells, pattern, strict=True):
+        if chosen:
+            total += cell
+    return total
+
+
+def _evidence(e: Ints, n: Ints, one: Floats, two: Floats) -> Floats:
+    result: Floats = one[e] + one[n - e] - two[n]
+    return result

@@ -1,0 +1,146 @@
+"""A head in the course of the search for what it hangs on: its splits so far, and the contexts that they lead to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.graphs.evidence import ACTION, ALL, SINGLE, VALUE, Chosen, Floats, Head, Ints
+
+Bools: TypeAlias = NDArray[np.bool_]
+Tables: TypeAlias = tuple[Floats, Floats]
+
+
+class Pair(NamedTuple):
+    """A context told apart by two columns.
+
+    Attributes:
+        gain: evidence beyond its price.
+        context: the context.
+        first, second: the columns.
+        pattern: which cells get a context of their own, see PATTERNS.
+    """
+
+    gain: float
+    context: int
+    first: int
+    second: int
+    pattern: tuple[bool, bool, bool, bool]
+
+
+@dataclass(frozen=True)
+class Split:
+    """Rows of some contexts told apart by a column.
+
+    Attributes:
+        column: the column; -1 for none, where contexts are only merged.
+        off, on: the new context of each old one, int64 [C each], where the column is off and on.
+        gain: evidence beyond its price, nats.
+    """
+
+    column: int
+    off: Ints
+    on: Ints
+    gain: float
+
+
+@dataclass
+class Search:
+    """A head in the course of the search.
+
+    Attributes:
+        head: its rows, with contexts as split so far.
+        typical: for each context, the rate of the rows on its side of the last split that it was part of, [C]: what to
+            expect of a context with few rows.
+        splits: in the order found.
+        open: whether more may be found.
+    """
+
+    head: Head
+    typical: Floats = field(init=False)
+    splits: list[Split] = field(default_factory=list)
+    open: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Starts with the rate of all rows."""
+        came = self.head.came
+        self.open = bool(len(came)) and 0 < came.sum() < len(came)
+        self.typical = np.full(len(self.head.action), came.mean() if len(came) else 0.5)
+
+    def counts(self, rows: Bools | None = None) -> tuple[Ints, Ints]:
+        """Rows and arrivals of each context, int64 [C] each; of some rows only where ``rows`` [R] is given."""
+        head, size = self.head, len(self.head.action)
+        context, came = (head.context, head.came) if rows is None else (head.context[rows], head.came[rows])
+        return np.bincount(context, minlength=size), np.bincount(context, weights=came, minlength=size).astype(np.int64)
+
+    def merge(self, tables: Tables) -> None:
+        """Lets all contexts share one rate where that has more evidence, as a split by no column would."""
+        n, e = self.counts()
+        if len(n) > 1 and _share(n, e, tables):
+            target, nowhere = np.zeros(len(n), dtype=np.int64), np.zeros(len(self.head.rows), dtype=np.bool_)
+            self._take(Split(-1, target, target, 0.0), nowhere, self.typical)
+
+    def divide(self, chosen: Chosen, table: Bools, tables: Tables) -> None:
+        """Does the split that was found; ``table`` [N, D] holds all columns."""
+        head, size = self.head, len(self.head.action)
+        on, covered = table[head.rows, chosen.column], self._covered(chosen)
+        targets = np.arange(size), np.where(covered, np.arange(size) + size, np.arange(size))
+        typical = np.concatenate([self.typical, self.typical])
+        for side, target in zip((~on, on), targets, strict=True):
+            n, e = self.counts(side & covered[head.context])
+            typical[target[covered]] = e.sum() / max(n.sum(), 1)
+            alike = covered if _share(n[covered], e[covered], tables) else covered & (n == 0)
+            if alike.any():
+                target[alike] = target[alike][0]
+        names, numbers = np.unique(np.concatenate(targets), return_inverse=True)
+        self._take(Split(chosen.column, numbers[:size], numbers[size:], chosen.gain), on, typical[names])
+
+    def divide_by_pair(self, pair: Pair, table: Bools) -> None:
+        """Gives the rows that a pair of columns tells apart a context of their own, in two splits."""
+        head, size = self.head, len(self.head.action)
+        rows = head.context == pair.context
+        cell = 2 * table[head.rows, pair.first] + table[head.rows, pair.second]
+        inside = np.asarray(pair.pattern)[cell]
+        rates = [head.came[rows & side].mean() if (rows & side).any() else 0.5 for side in (~inside, inside)]
+        same, apart = np.arange(size), np.where(np.arange(size) == pair.context, size, np.arange(size))
+        typical = np.append(self.typical, self.typical[pair.context])
+        self._take(Split(pair.first, same, apart, pair.gain), table[head.rows, pair.first], typical)
+        targets = np.arange(size + 1), np.arange(size + 1)  # size: the first is on; pair.context: it is off
+        for second, target in enumerate(targets):
+            target[pair.context] = size if pair.pattern[second] else pair.context
+            target[size] = size if pair.pattern[2 + second] else pair.context
+        typical[pair.context], typical[size] = rates
+        self._take(Split(pair.second, *targets, 0.0), table[head.rows, pair.second], typical)
+
+    def _take(self, split: Split, on: Bools, typical: Floats) -> None:
+        head, size = self.head, int(max(split.on.max(), split.off.max())) + 1
+        context = np.where(on, split.on[head.context], split.off[head.context])
+        labels = []
+        for old in (head.action, head.value):  # a merged context keeps only what all its parts have in common
+            low, high = np.full(size, np.iinfo(np.int64).max), np.full(size, -2)
+            for target in (split.off, split.on):
+                np.minimum.at(low, target, old)
+                np.maximum.at(high, target, old)
+            labels.append(np.where(low == high, low, -1))
+        self.head = Head(head.rows, head.came, context, labels[0], labels[1])
+        self.typical = typical[:size]
+        self.splits.append(split)
+
+    def _covered(self, chosen: Chosen) -> Bools:
+        """Which contexts a split is about, bool [C]."""
+        head = self.head
+        if chosen.kind == ALL:
+            return np.ones(len(head.action), dtype=np.bool_)
+        labels = {ACTION: head.action, VALUE: head.value, SINGLE: np.arange(len(head.action))}[chosen.kind]
+        covered: Bools = labels == chosen.which
+        return covered
+
+
+def _share(n: Ints, e: Ints, tables: Tables) -> bool:
+    """Whether contexts with these counts have more evidence for one rate than for a rate each."""
+    one, two = tables
+    apart = (one[e] + one[n - e] - two[n]).sum()
+    return bool(one[e.sum()] + one[(n - e).sum()] - two[n.sum()] > apart)

@@ -1,0 +1,154 @@
+"""From transitions to questions: which value of which unit comes, asked of the rows in which it is possible at all.
+
+A *unit* is a factor, or a group of bits of which exactly one is on; ``terminated`` is one more unit, and so is whether a
+rare event happens. A *column* is on or off: a bit, one value of a factor with more than two, or an action.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.graphs.evidence import Head
+
+Ints: TypeAlias = NDArray[np.int64]
+Bools: TypeAlias = NDArray[np.bool_]
+
+
+class Layout(NamedTuple):
+    """Where units and columns lie in a state; for compiled kernels, too.
+
+    Attributes:
+        outputs: number of values of each unit, int64 [U]; the last two units are ``terminated`` and the event.
+        first: where each unit's factors begin in ``members``, int64 [U + 1].
+        members: factors of each unit; several for a group, one for a factor, none for the last two.
+        factor, value: what each state column stands for, int64 [D'].
+        n_factors: number of factors F.
+        n_actions: number of actions A; D = D' + A columns in all.
+    """
+
+    outputs: Ints
+    first: Ints
+    members: Ints
+    factor: Ints
+    value: Ints
+    n_factors: int
+    n_actions: int
+
+
+def lay_out(cardinalities: Sequence[int], groups: Sequence[Sequence[int]], n_actions: int) -> Layout:
+    """Units of factors: the groups first, then all other factors in their order, then ``terminated`` and the event."""
+    grouped = {f for group in groups for f in group}
+    members = [*(list(group) for group in groups), *([f] for f in range(len(cardinalities)) if f not in grouped), [], []]
+    sizes = [len(group) for group in groups] + [cardinalities[unit[0]] for unit in members[len(groups) : -2]] + [2, 2]
+    columns = [(f, v) for f, c in enumerate(cardinalities) for v in (range(c) if c != 2 else (1,))]
+    factor, value = np.asarray(columns, dtype=np.int64).reshape(-1, 2).T
+    return Layout(
+        np.asarray(sizes, dtype=np.int64),
+        np.concatenate([[0], np.cumsum([len(unit) for unit in members])]).astype(np.int64),
+        np.asarray([f for unit in members for f in unit], dtype=np.int64),
+        np.ascontiguousarray(factor),
+        np.ascontiguousarray(value),
+        len(cardinalities),
+        int(n_actions),
+    )
+
+
+def unit_values(layout: Layout, states: Ints) -> Ints:
+    """Value of each unit of factors, int64 [B, U - 2], in states [B, F]; in a group the first bit that is on counts."""
+    values = np.empty((len(states), len(layout.outputs) - 2), dtype=np.int64)
+    for unit in range(values.shape[1]):
+        members = layout.members[layout.first[unit] : layout.first[unit + 1]]
+        values[:, unit] = states[:, members[0]] if len(members) == 1 else states[:, members].argmax(axis=1)
+    return values
+
+
+def column_table(layout: Layout, states: Ints, actions: Ints) -> Bools:
+    """Which columns are on, bool [B, D]: those of states [B, F], then those of actions [B]."""
+    return np.concatenate(
+        [states[:, layout.factor] == layout.value, actions[:, None] == np.arange(layout.n_actions)],
+        axis=1,
+    )
+
+
+def column_kinds(layout: Layout, states: Ints, changing: Bools) -> Ints:
+    """Which kind of thing each column is, int64 [D], by what can be seen without knowing the world.
+
+    The values of one unit are one kind; so are all bits that change, and all actions; bits that stay fall in two kinds by
+    how often they are on, where the largest gap is.
+
+    Args:
+        layout: the units.
+        states: int64 [N, F].
+        changing: which factors change, bool [F].
+    """
+    n_columns = len(layout.factor)
+    kinds = np.zeros(n_columns + layout.n_actions, dtype=np.int64)
+    kinds[n_columns:] = 1
+    of_factor = np.full(layout.n_factors, -1)
+    for unit in np.flatnonzero(np.diff(layout.first) * (layout.outputs > 2)):
+        of_factor[layout.members[layout.first[unit] : layout.first[unit + 1]]] = unit
+    owner = of_factor[layout.factor]
+    kinds[:n_columns][owner >= 0] = 4 + owner[owner >= 0]
+    still = np.flatnonzero((owner < 0) & ~changing[layout.factor])
+    if len(still) == 0:
+        return kinds
+    often = np.log(states[:, layout.factor[still]].mean(axis=0) + 1e-3)
+    order, edge = np.argsort(often, kind="stable"), len(still) // 6
+    gaps = np.diff(often[order])[edge : len(still) - 1 - edge]
+    cut = edge + int(gaps.argmax()) + 1 if len(gaps) else len(still)
+    kinds[still[order[:cut]]] = 2
+    kinds[still[order[cut:]]] = 3
+    return kinds
+
+
+@dataclass(frozen=True)
+class Question:
+    """Whether a unit takes a value, in the contexts (action, present value) in which that is possible.
+
+    Attributes:
+        unit: number of the unit.
+        value: the value; 1 for a binary unit.
+        pairs: action times cardinality plus present value, of each context, int64 [C], ascending.
+        head: the rows.
+    """
+
+    unit: int
+    value: int
+    pairs: Ints
+    head: Head
+
+
+def ask(unit: int, cardinality: int, actions: Ints, now: Ints, then: Ints, rows: Ints) -> list[Question]:
+    """The questions about one unit; none if it never changes.
+
+    Args:
+        unit: its number.
+        cardinality: number of its values.
+        actions: int64 [N].
+        now: its values, int64 [N].
+        then: those that follow, int64 [N].
+        rows: which rows to ask, int64 [R].
+    """
+    pair = actions * cardinality + now
+    if (now[rows] == then[rows]).all():
+        return []
+    if cardinality == 2:
+        return [_question(unit, 1, cardinality, pair, then, rows)]
+    asked = []
+    for value in np.unique(then[rows][now[rows] != then[rows]]):
+        leading = np.unique(pair[rows][then[rows] == value])
+        leading = leading[leading % cardinality != value]
+        asked.append(_question(unit, int(value), cardinality, pair, then, rows[np.isin(pair[rows], leading)]))
+    return asked
+
+
+def _question(unit: int, value: int, cardinality: int, pair: Ints, then: Ints, rows: Ints) -> Question:
+    pairs, context = np.unique(pair[rows], return_inverse=True)
+    came = (then[rows] == value).astype(np.int64)
+    head = Head(rows, came, context.astype(np.int64), pairs // cardinality, pairs % cardinality)
+    return Question(unit, value, pairs, head)
