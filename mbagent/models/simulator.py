@@ -31,6 +31,9 @@ class SimulatorModel(BaseTransitionModel):
 
     Args:
         game: the game; its observation is the whole state.
+
+    Attributes:
+        lists: whether the game can list its successors with their probabilities.
     """
 
     def __init__(self, game: Game) -> None:
@@ -38,7 +41,7 @@ class SimulatorModel(BaseTransitionModel):
         self.space = FactoredSpace(game.observation_space)
         super().__init__(self.space.cardinalities, int(game.action_space.n))
         self._shape = game.observation_space.shape
-        self._lists = type(game).transition_distributions is not Game.transition_distributions
+        self.lists = type(game).transition_distributions is not Game.transition_distributions
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """Does nothing: the rules are known."""
@@ -88,7 +91,7 @@ class SimulatorModel(BaseTransitionModel):
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
         """See TransitionModel; where the game cannot list successors they are drawn, with numbers shared by all rows."""
-        if not self._lists:
+        if not self.lists:
             return super().successors(states, actions, n_samples, seed)
         return thin(self._listed(states, actions), n_samples, seed)
 

@@ -36,6 +36,9 @@ LEAST = 1.0
 MOST_COLUMNS = 1500
 """Pairs are looked for among so many columns at most."""
 
+TELLING = 2
+"""Pairs from which on their kinds tell what kinds the next ones are of."""
+
 MOST_CONTEXTS = 4
 """Contexts of a head that pairs are looked for in, the most mixed ones."""
 
@@ -81,7 +84,7 @@ class PairSearch:
     def _prior(self) -> Floats:
         """Log prior odds of each pair of columns, [D, D]: pairs of a kind already found are likelier, of fresh columns most."""
         n = len(self.kinds)
-        if len(self._found) < 3:
+        if len(self._found) < TELLING:
             return np.full((n, n), -math.log(max(1.0, len(PATTERNS) * n * (n - 1) / 2)) - FIRST)
         n_kinds = int(self.kinds.max()) + 1
         share, used = np.full((n_kinds, n_kinds), 0.2 / n_kinds**2), np.zeros(n, dtype=np.bool_)
