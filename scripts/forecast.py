@@ -33,7 +33,7 @@ class Args:
     """Compare forecasts some steps ahead."""
 
     full: bool = False
-    """Every n from 1 to 15, 3 seeds, 20,000 steps of experience, and the returns of a planner (about an hour)."""
+    """Every n from 1 to 15, 3 seeds, 20,000 steps of experience, and the returns of a planner (about 40 minutes)."""
     games: tuple[str, ...] = tuple(case.name for case in CASES)
     """Which games."""
     steps: tuple[int, ...] | None = None

@@ -110,7 +110,8 @@ def _draw_panel(axes: Axes, table: Table) -> None:
             continue  # zero by definition
         cells = [row.errors[method] for row in table.rows]
         axes.plot(steps, [c.estimate for c in cells], color=colour, marker=marker or None, markersize=4, label=label)
-        axes.fill_between(steps, [max(c.low, 0.0) for c in cells], [c.high for c in cells], color=colour, alpha=0.15, linewidth=0)
+        low, high = [max(c.low, 0.0) for c in cells], [min(c.high, 1.0) for c in cells]  # every measure is a share
+        axes.fill_between(steps, low, high, color=colour, alpha=0.15, linewidth=0)
     axes.set_title(table.name, loc="left")
     axes.set_ylabel(MEASURES[table.measure], fontsize=8)
     axes.set_xlabel("steps ahead n")
