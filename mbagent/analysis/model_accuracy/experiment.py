@@ -28,7 +28,7 @@ MOST_UNCERTAIN = 0.25
 """Transitions in which a larger share of the factors is random, such as new layouts, are not judged by exactness."""
 
 SECOND_DRAWS = 64
-"""True draws that must agree on a factor for it to count as certain."""
+"""True draws that must agree on a factor for it to count as certain, in worlds that do not list their successors."""
 
 LEARNING_RATE = 0.02
 
@@ -201,9 +201,16 @@ def certain_factors(true: SimulatorModel, rows: TransitionBatch, order: States, 
     """Which factors of each transition's outcome are not random, bool [N, F]; none of it where too many are."""
     back = np.argsort(order)
     certain = np.ones(rows.states.shape, dtype=np.bool_)
-    for draw in range(SECOND_DRAWS):
-        again, _ = true.sample(rows.states[:, back], rows.actions, derive(seed, draw, np.arange(len(rows))))
-        certain &= again[:, order] == rows.next_states
+    if true.lists:
+        for begin in range(0, len(rows), 10_000):
+            part = rows.select(np.arange(begin, min(begin + 10_000, len(rows))))
+            listed = true.successors(part.states[:, back], part.actions, 10_000, 0)
+            other = listed.states[:, order] != part.next_states[listed.rows]
+            certain[begin : begin + 10_000] = ~np.logical_or.reduceat(other, listed.offsets[:-1], axis=0)
+    else:
+        for draw in range(SECOND_DRAWS):
+            again, _ = true.sample(rows.states[:, back], rows.actions, derive(seed, draw, np.arange(len(rows))))
+            certain &= again[:, order] == rows.next_states
     certain[(~certain).mean(axis=1) > MOST_UNCERTAIN] = False
     return certain
 

@@ -1,5 +1,6 @@
 """Structure found in data: bits that exclude each other, rare events, and what each variable hangs on."""
 
+from mbagent.models.graphs.local import LocalGraphModel, channel_cardinalities
 from mbagent.models.graphs.model import DecisionGraphModel
 
-__all__ = ["DecisionGraphModel"]
+__all__ = ["DecisionGraphModel", "LocalGraphModel", "channel_cardinalities"]

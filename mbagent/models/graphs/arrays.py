@@ -19,8 +19,13 @@ def to_arrays(graphs: Graphs) -> dict[str, NDArray[Any]]:
     return {name: array.copy() for name, array in graphs._asdict().items()}
 
 
-def from_arrays(arrays: Mapping[str, NDArray[Any]], layout: Layout) -> Graphs:
+def from_arrays(arrays: Mapping[str, NDArray[Any]], layout: Layout, n_columns: int) -> Graphs:
     """The graphs that ``to_arrays`` took apart.
+
+    Args:
+        arrays: by name.
+        layout: the units.
+        n_columns: number of columns that nodes can ask for.
 
     Raises:
         ValueError: they are no graphs of these units.
@@ -31,12 +36,12 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]], layout: Layout) -> Graphs:
     kinds = {name: np.float64 if name in _FLOATS else np.int64 for name in Graphs._fields}
     flat: dict[str, Any] = {name: np.ascontiguousarray(array, dtype=kinds[name]).reshape(-1) for name, array in arrays.items()}
     graphs = Graphs(**flat)
-    if not _sound(graphs, layout):
+    if not _sound(graphs, layout, n_columns):
         raise ValueError("These weights are no decision graphs of these units; load them into a model of the same environment.")
     return graphs
 
 
-def _sound(graphs: Graphs, layout: Layout) -> bool:
+def _sound(graphs: Graphs, layout: Layout, n_columns: int) -> bool:
     """Whether every index leads somewhere and no path is endless."""
     n_units, n_nodes, n_entries = len(layout.outputs), len(graphs.column), len(graphs.values)
     pairs = np.concatenate([[0], np.cumsum(layout.n_actions * layout.outputs)])
@@ -60,7 +65,7 @@ def _sound(graphs: Graphs, layout: Layout) -> bool:
     asks, numbers = graphs.column >= 0, np.arange(n_nodes)
     return bool(
         _within(graphs.changing, n_units)
-        and _within(graphs.column + 1, len(layout.factor) + layout.n_actions + 1)
+        and _within(graphs.column + 1, n_columns + 1)
         and _within(graphs.nodes, n_nodes)
         and (np.diff(graphs.entries) >= 0).all()
         and (graphs.entries[0], graphs.entries[-1]) == (0, n_entries)

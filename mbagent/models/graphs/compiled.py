@@ -253,6 +253,26 @@ def show(state: Ints, action: int, layout: Layout, on: Bools) -> None:
         on[column] = state[layout.factor[column]] == layout.value[column]
     for other in range(layout.n_actions):
         on[n + other] = other == action
+    n += layout.n_actions
+    for m in range(len(layout.meetings)):
+        on[n + m] = _meets(state, layout.cells, layout.meetings[m])
+
+
+@compiled
+def _meets(state: Ints, cells: Ints, meeting: Ints) -> bool:
+    _, height, width = cells.shape
+    below, right = meeting[4], meeting[5]
+    for y in range(max(0, -below), min(height, height - below)):
+        for x in range(max(0, -right), min(width, width - right)):
+            if state[cells[meeting[0], y, x]] == meeting[1] and state[cells[meeting[2], y + below, x + right]] == meeting[3]:
+                return True
+    return False
+
+
+@compiled
+def n_columns(layout: Layout) -> int:
+    """Number of columns D."""
+    return len(layout.factor) + layout.n_actions + len(layout.meetings)
 
 
 @compiled

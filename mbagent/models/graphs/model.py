@@ -23,7 +23,7 @@ from mbagent.models.base import (
 )
 from mbagent.models.graphs import draws
 from mbagent.models.graphs.arrays import from_arrays, to_arrays
-from mbagent.models.graphs.compiled import Graphs, build, habit_of
+from mbagent.models.graphs.compiled import Graphs, build, habit_of, n_columns
 from mbagent.models.graphs.events import flag_events
 from mbagent.models.graphs.fitting import Fitted, fit_graphs
 from mbagent.models.graphs.units import lay_out
@@ -137,13 +137,13 @@ class DecisionGraphModel(BaseTransitionModel):
 
     def _draw(self, states: States, actions: Actions, keys: Keys) -> tuple[States, Bools]:
         fitted, following, over = self.fitted, states.copy(), np.zeros(len(states), dtype=np.bool_)
-        draws.sample(states, actions, keys, fitted.layout, fitted.usual, following, over)
+        draws.sample(states, actions, keys, False, fitted.layout, fitted.usual, following, over)
         if fitted.has_event:
             happens = np.flatnonzero(uniforms(derive(keys, _EVENT), 1)[:, 0] < self._event_rates(states, actions))
             if len(happens):
                 given = states[happens]
                 redrawn, ends = given.copy(), np.zeros(len(happens), dtype=np.bool_)
-                draws.sample(given, actions[happens], keys[happens], fitted.layout, fitted.event, redrawn, ends)
+                draws.sample(given, actions[happens], keys[happens], False, fitted.layout, fitted.event, redrawn, ends)
                 following[happens], over[happens] = redrawn, ends
         return following, over
 
@@ -151,12 +151,13 @@ class DecisionGraphModel(BaseTransitionModel):
         """The likeliest next states, unit by unit, int64 [B, F], and whether they end the episode, bool [B]."""
         states, actions = self._rows(states, actions)
         following, over = states.copy(), np.zeros(len(states), dtype=np.bool_)
-        draws.likeliest(states, actions, self.fitted.layout, self.fitted.usual, following, over)
+        keys = np.zeros(len(states), dtype=np.uint64)
+        draws.sample(states, actions, keys, True, self.fitted.layout, self.fitted.usual, following, over)
         happens = np.flatnonzero(self._event_rates(states, actions) > 0.5)
         if len(happens):
             given = states[happens]
             redrawn, ends = given.copy(), np.zeros(len(happens), dtype=np.bool_)
-            draws.likeliest(given, actions[happens], self.fitted.layout, self.fitted.event, redrawn, ends)
+            draws.sample(given, actions[happens], keys[happens], True, self.fitted.layout, self.fitted.event, redrawn, ends)
             following[happens], over[happens] = redrawn, ends
         return following, over
 
@@ -239,7 +240,8 @@ class DecisionGraphModel(BaseTransitionModel):
             )
         layout = lay_out(self.cardinalities, groups, self.n_actions)
         usual, event = (
-            from_arrays({part: state[f"{name}.{part}"] for part in Graphs._fields}, layout) for name in ("usual", "event")
+            from_arrays({part: state[f"{name}.{part}"] for part in Graphs._fields}, layout, n_columns(layout))
+            for name in ("usual", "event")
         )
         self.fitted = Fitted(layout, usual, event, bool(state["has_event"]), (), ())
 

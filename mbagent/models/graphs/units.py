@@ -28,7 +28,16 @@ class Layout(NamedTuple):
         members: factors of each unit; several for a group, one for a factor, none for the last two.
         factor, value: what each state column stands for, int64 [D'].
         n_factors: number of factors F.
-        n_actions: number of actions A; D = D' + A columns in all.
+        n_actions: number of actions A.
+        cells: where the observation is a stack of planes, the factor of each channel in each row and column, int64 [C, H, W];
+            else empty.
+        meetings: columns that are on where, anywhere on the planes, a channel has a value and so has another (or the same) so
+            many rows below and columns to the right: (channel, value, channel, value, rows, columns), int64 [M, 6].
+            D = D' + A + M columns in all.
+        coupled_first: where each coupling's units begin in ``coupled``, int64 [Q + 1].
+        coupled: units, all bits, of which at most one is on after a step.
+        exactly: whether it is exactly one, bool [Q].
+        coupling_of: coupling that each unit is in, or -1, int64 [U].
     """
 
     outputs: Ints
@@ -38,6 +47,12 @@ class Layout(NamedTuple):
     value: Ints
     n_factors: int
     n_actions: int
+    cells: Ints
+    meetings: Ints
+    coupled_first: Ints
+    coupled: Ints
+    exactly: Bools
+    coupling_of: Ints
 
 
 def lay_out(cardinalities: Sequence[int], groups: Sequence[Sequence[int]], n_actions: int) -> Layout:
@@ -55,6 +70,12 @@ def lay_out(cardinalities: Sequence[int], groups: Sequence[Sequence[int]], n_act
         np.ascontiguousarray(value),
         len(cardinalities),
         int(n_actions),
+        np.zeros((0, 0, 0), dtype=np.int64),
+        np.zeros((0, 6), dtype=np.int64),
+        np.zeros(1, dtype=np.int64),
+        np.zeros(0, dtype=np.int64),
+        np.zeros(0, dtype=np.bool_),
+        np.full(len(sizes), -1, dtype=np.int64),
     )
 
 

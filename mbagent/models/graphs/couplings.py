@@ -1,0 +1,72 @@
+"""Bits of which at most one is on after a step: their rates become the chances of one draw, compiled.
+
+A bit's rate is what its own graph says of it alone. Where one bit at most can be on, those rates are the probabilities of
+one draw among the bits and "none"; where exactly one is on, they are scaled to leave nothing for "none".
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, distribution, read
+from mbagent.models.graphs.units import Layout
+from mbagent_envs._compiled import compiled
+
+
+@compiled
+def widest(layout: Layout) -> int:
+    """Room that the distribution of any unit or coupling needs."""
+    room = layout.outputs.max()
+    for q in range(len(layout.exactly)):
+        room = max(room, layout.coupled_first[q + 1] - layout.coupled_first[q] + 1)
+    return int(room)
+
+
+@compiled
+def chances(state: Ints, action: int, layout: Layout, graphs: Graphs, on: Bools, out: Floats) -> None:
+    """Writes the rate of every coupled bit to ``out`` [U]; that of a bit without graphs is the bit."""
+    if len(layout.exactly) == 0:
+        return
+    for unit in layout.coupled:
+        out[unit] = read(state, unit, layout)
+    both = np.empty(2, dtype=np.float64)
+    for unit in graphs.changing:
+        if layout.coupling_of[unit] >= 0:
+            distribution(unit, read(state, unit, layout), action, layout, graphs, on, both)
+            out[unit] = both[1]
+
+
+@compiled
+def couple(coupling: int, rates: Floats, layout: Layout, out: Floats) -> int:
+    """Writes the probability of each bit of a coupling, and of none, to ``out``; returns how many bits there are."""
+    first, last = layout.coupled_first[coupling], layout.coupled_first[coupling + 1]
+    n, total = last - first, 0.0
+    for k in range(n):
+        out[k] = rates[layout.coupled[first + k]]
+        total += out[k]
+    none = 0.0 if layout.exactly[coupling] and total > 1e-9 else max(0.0, 1.0 - total)
+    for k in range(n):
+        out[k] /= total + none
+    out[n] = none / (total + none)
+    return int(n)
+
+
+@compiled
+def settle(state: Ints, coupling: int, chosen: int, layout: Layout) -> None:
+    """Switches the chosen bit of a coupling on and all others off; none where ``chosen`` is their number."""
+    first, last = layout.coupled_first[coupling], layout.coupled_first[coupling + 1]
+    for k in range(last - first):
+        state[layout.members[layout.first[layout.coupled[first + k]]]] = 1 if k == chosen else 0
+
+
+@compiled
+def which(state: Ints, coupling: int, layout: Layout) -> int:
+    """Which bit of a coupling is on; their number if none is, -1 if several are."""
+    first, last = layout.coupled_first[coupling], layout.coupled_first[coupling + 1]
+    found = last - first
+    for k in range(last - first):
+        if state[layout.members[layout.first[layout.coupled[first + k]]]] == 1:
+            if found < last - first:
+                return -1
+            found = k
+    return int(found)

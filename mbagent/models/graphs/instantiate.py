@@ -1,0 +1,203 @@
+"""From graphs of relative columns, one for each channel, to graphs for every cell of a board of any size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.graphs.compiled import Graphs
+from mbagent.models.graphs.units import Layout, lay_out
+from mbagent.models.graphs.windows import ACTION, BORDER, CELL, MEETING
+from mbagent.spaces import PlaneLayout
+
+Ints: TypeAlias = NDArray[np.int64]
+
+WHOLE, ROW, COLUMN = 0, 1, 2
+"""What cells of a channel a coupling is about."""
+
+
+class Coupling(NamedTuple):
+    """Cells of a channel of which at most one is on after a step.
+
+    Attributes:
+        channel: the channel, of bits.
+        kind: WHOLE, ROW or COLUMN.
+        line: which row or column, from the top or left; counted from the other end, -1 first, where it lies nearer to that.
+        exactly: whether it is exactly one.
+    """
+
+    channel: int
+    kind: int
+    line: int
+    exactly: bool
+
+    def cells(self) -> tuple[slice | int, slice | int]:
+        """Its rows and columns."""
+        rows = self.line if self.kind == ROW else slice(None)
+        columns = self.line if self.kind == COLUMN else slice(None)
+        return rows, columns
+
+
+@dataclass(frozen=True)
+class LocalGraphs:
+    """What holds at every position.
+
+    Attributes:
+        graphs: units are the channels, then ``terminated`` and the event; columns are relative.
+        columns: the relative columns, int64 [D, 7], see ``windows.py``.
+        cardinalities: number of values of each channel's cells, length C.
+        n_actions: number of actions A.
+        couplings: bits of which at most one is on.
+    """
+
+    graphs: Graphs
+    columns: Ints
+    cardinalities: tuple[int, ...]
+    n_actions: int
+    couplings: tuple[Coupling, ...]
+
+
+def instantiate(local: LocalGraphs, board: PlaneLayout) -> tuple[Layout, Graphs]:
+    """Units and graphs for a board."""
+    n_factors = board.channels * board.height * board.width
+    cells = board.to_planes(np.arange(n_factors)[None])[0]
+    cardinalities = np.empty(n_factors, dtype=np.int64)
+    for channel, values in enumerate(local.cardinalities):
+        cardinalities[cells[channel]] = values
+    used = np.unique(local.graphs.column[local.graphs.column >= 0])
+    meetings = used[local.columns[used, 0] == MEETING]
+    layout = lay_out([int(c) for c in cardinalities], (), local.n_actions)
+    layout = layout._replace(cells=cells, meetings=np.ascontiguousarray(local.columns[meetings, 1:]))
+    layout = _couple(layout, local.couplings)
+    return layout, _Board(local, layout, meetings).graphs()
+
+
+def _couple(layout: Layout, couplings: Sequence[Coupling]) -> Layout:
+    """The layout with its couplings; a cell is in the first that claims it."""
+    of, exactly = layout.coupling_of.copy(), []
+    groups: list[Ints] = []
+    for coupling in couplings:
+        members = layout.cells[coupling.channel][coupling.cells()].ravel()
+        members = members[of[members] < 0]
+        if len(members) > 1:
+            of[members] = len(groups)
+            groups.append(members)
+            exactly.append(coupling.exactly)
+    first = np.concatenate([[0], np.cumsum([len(group) for group in groups])]).astype(np.int64)
+    coupled = np.concatenate([*groups, np.zeros(0, dtype=np.int64)]).astype(np.int64)
+    return layout._replace(coupled_first=first, coupled=coupled, exactly=np.asarray(exactly, dtype=np.bool_), coupling_of=of)
+
+
+class _Board:
+    """Graphs of all cells while they are built. A cell's unit has the number of its factor."""
+
+    def __init__(self, local: LocalGraphs, layout: Layout, meetings: Ints) -> None:
+        self.local, self.layout = local, layout
+        self.links: list[tuple[int, int, int]] = []
+        self.leaves: list[int] = []
+        self.first_column = np.searchsorted(layout.factor, np.arange(layout.n_factors))
+        self.meeting = {int(d): len(layout.factor) + layout.n_actions + i for i, d in enumerate(meetings)}
+
+    def graphs(self) -> Graphs:
+        """All of them."""
+        local, layout, graphs = self.local, self.layout, self.local.graphs
+        _, height, width = layout.cells.shape
+        pairs = np.concatenate([[0], np.cumsum(layout.n_actions * layout.outputs)]).astype(np.int64)
+        shared = {int(node): self._add(-1, 0, 0, int(node)) for node in np.flatnonzero(graphs.column < 0)}
+        channel_of = np.full(len(layout.outputs), len(local.cardinalities))
+        entries: list[tuple[int, int, int]] = []
+        for channel in graphs.changing:
+            nodes = self._nodes_of(int(channel))
+            places = (
+                [(int(layout.cells[channel, y, x]), y, x) for y in range(height) for x in range(width)]
+                if channel < len(local.cardinalities)
+                else [(layout.n_factors, 0, 0)]
+            )
+            for unit, y, x in places:
+                copies = self._copy(nodes, shared, y, x)
+                entries += self._entries(int(channel), int(pairs[unit]), copies)
+        for channel in range(len(local.cardinalities)):
+            channel_of[layout.cells[channel]] = channel
+        channel_of[-1] = len(local.cardinalities) + 1
+        table = np.asarray(sorted(entries), dtype=np.int64).reshape(-1, 3)
+        links, leaves = np.asarray(self.links, dtype=np.int64).reshape(-1, 3), np.asarray(self.leaves, dtype=np.int64)
+        changing = np.flatnonzero(np.isin(channel_of, graphs.changing))
+        return Graphs(
+            changing.astype(np.int64),
+            pairs,
+            np.searchsorted(table[:, 0], np.arange(pairs[-1] + 1)).astype(np.int64),
+            np.ascontiguousarray(table[:, 1]),
+            np.ascontiguousarray(table[:, 2]),
+            np.ascontiguousarray(links[:, 0]),
+            np.ascontiguousarray(links[:, 1]),
+            np.ascontiguousarray(links[:, 2]),
+            np.where(leaves >= 0, graphs.rate[leaves], 0.0),
+            np.where(leaves >= 0, graphs.spread[leaves], 0.0),
+            np.concatenate([graphs.stays[graphs.pairs[c] : graphs.pairs[c + 1]] for c in channel_of]),
+            np.concatenate([graphs.novelty[graphs.pairs[c] : graphs.pairs[c + 1]] for c in channel_of]),
+            np.concatenate([[0], np.cumsum(layout.outputs)]).astype(np.int64),
+            np.concatenate([graphs.base[graphs.start[c] : graphs.start[c + 1]] for c in channel_of]),
+            graphs.still,
+        )
+
+    def _add(self, column: int, off: int, on: int, leaf: int = -1) -> int:
+        self.links.append((column, off, on))
+        self.leaves.append(leaf)
+        return len(self.links) - 1
+
+    def _nodes_of(self, channel: int) -> list[int]:
+        """Inner nodes of a channel's graphs, children first."""
+        graphs = self.local.graphs
+        begin, end = graphs.entries[graphs.pairs[channel]], graphs.entries[graphs.pairs[channel + 1]]
+        found: set[int] = set()
+        stack = [int(node) for node in graphs.nodes[begin:end]]
+        while stack:
+            node = stack.pop()
+            if node not in found and graphs.column[node] >= 0:
+                found.add(node)
+                stack += [int(graphs.off[node]), int(graphs.on[node])]
+        return sorted(found)
+
+    def _copy(self, nodes: Sequence[int], shared: dict[int, int], y: int, x: int) -> dict[int, int]:
+        """Nodes for a position; what the border decides there is decided."""
+        graphs, copies = self.local.graphs, dict(shared)
+        for node in nodes:
+            off, on = copies[int(graphs.off[node])], copies[int(graphs.on[node])]
+            column = self._absolute(int(graphs.column[node]), y, x)
+            copies[node] = off if column == _NEVER or off == on else on if column == _ALWAYS else self._add(column, off, on)
+        return copies
+
+    def _absolute(self, relative: int, y: int, x: int) -> int:
+        """Column of the board that a relative column is at a position."""
+        _, height, width = self.layout.cells.shape
+        kind, *parts = (int(part) for part in self.local.columns[relative])
+        if kind == ACTION:
+            return len(self.layout.factor) + parts[0]
+        if kind == MEETING:
+            return self.meeting[relative]
+        row, column = (y + parts[2], x + parts[3]) if kind == CELL else (y + parts[0], x + parts[1])
+        inside = 0 <= row < height and 0 <= column < width
+        if kind == BORDER:
+            return _NEVER if inside else _ALWAYS
+        if not inside:
+            return _NEVER
+        value = parts[1] if self.local.cardinalities[parts[0]] != 2 else 0
+        return int(self.first_column[self.layout.cells[parts[0], row, column]]) + value
+
+    def _entries(self, channel: int, begin: int, copies: dict[int, int]) -> list[tuple[int, int, int]]:
+        """Entries (pair, value, node) of a unit whose pairs begin at ``begin``."""
+        graphs = self.local.graphs
+        first, last = graphs.pairs[channel], graphs.pairs[channel + 1]
+        return [
+            (begin + int(pair - first), int(graphs.values[entry]), copies[int(graphs.nodes[entry])])
+            for pair in range(first, last)
+            for entry in range(graphs.entries[pair], graphs.entries[pair + 1])
+        ]
+
+
+_NEVER, _ALWAYS = -2, -3
+"""Columns that the border decides."""
