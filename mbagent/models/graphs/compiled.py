@@ -276,42 +276,43 @@ def n_columns(layout: Layout) -> int:
 
 
 @compiled
-def _leaf(node: int, graphs: Graphs, on: Bools) -> int:
-    while graphs.column[node] >= 0:
-        node = graphs.on[node] if on[graphs.column[node]] else graphs.off[node]
-    return node
-
-
-@compiled
-def distribution(unit: int, value: int, action: int, layout: Layout, graphs: Graphs, on: Bools, out: Floats) -> None:
-    """Writes the distribution of a unit that is at ``value`` to ``out`` [its cardinality].
+def distributions(
+    units: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs, on: Bools, values: Ints, out: Floats
+) -> None:
+    """Writes value and next distribution of some units to ``values`` [U] and, from ``start[unit]`` on, to ``out``.
 
     The graphs give the rates of all values but the present one, which has the rest. Where the unit was never seen to stay,
-    the rest is taken for an error of estimation unless it is larger than such an error can be.
+    the rest is taken for an error of estimation unless it is larger than such an error can be. All units are done in one
+    call: handing the graphs over costs more than a unit does.
     """
-    n = layout.outputs[unit]
-    pair = graphs.pairs[unit] + action * n + value
-    begin, end = graphs.entries[pair], graphs.entries[pair + 1]
-    if n == 2:
-        rate = graphs.still[0] if value == 0 else 1.0 - graphs.still[0]
-        if begin < end:
-            rate = graphs.rate[_leaf(graphs.nodes[begin], graphs, on)]
-        out[0], out[1] = 1.0 - rate, rate
-        return
-    for k in range(n):
-        out[k] = 0.0
-    total, slack = 0.0, 0.0
-    for entry in range(begin, end):
-        leaf = _leaf(graphs.nodes[entry], graphs, on)
-        out[graphs.values[entry]] = graphs.rate[leaf]
-        total += graphs.rate[leaf]
-        slack += 3.0 * graphs.spread[leaf]
-    stay = 1.0 - total
-    if begin < end:
-        stays = graphs.stays[pair]
-        stay = max(0.0, stay - slack) if stays == 0.0 else max(stay, min(slack, stays))
-    out[value] = stay
-    novelty = graphs.novelty[pair]
-    scale = (1.0 - novelty) / (total + stay)
-    for k in range(n):
-        out[k] = out[k] * scale + novelty * graphs.base[graphs.start[unit] + k]
+    for unit in units:
+        first, n, start = layout.first[unit], layout.outputs[unit], graphs.start[unit]
+        value = state[layout.members[first]] if layout.first[unit + 1] == first + 1 else 0
+        for member in range(first + 1, layout.first[unit + 1]):
+            if state[layout.members[member]] == 1:
+                value = member - first
+        values[unit] = value
+        pair = graphs.pairs[unit] + action * n + value
+        total, slack = 0.0, 0.0
+        for k in range(start, start + n):
+            out[k] = 0.0
+        for entry in range(graphs.entries[pair], graphs.entries[pair + 1]):
+            node = graphs.nodes[entry]
+            while graphs.column[node] >= 0:
+                node = graphs.on[node] if on[graphs.column[node]] else graphs.off[node]
+            out[start + graphs.values[entry]] = graphs.rate[node]
+            total += graphs.rate[node]
+            slack += 3.0 * graphs.spread[node]
+        known = graphs.entries[pair + 1] > graphs.entries[pair]
+        if n == 2:
+            rate = out[start + 1] if known else graphs.still[0] if value == 0 else 1.0 - graphs.still[0]
+            out[start], out[start + 1] = 1.0 - rate, rate
+            continue
+        stay, stays = 1.0 - total, graphs.stays[pair]
+        if known:
+            stay = max(0.0, stay - slack) if stays == 0.0 else max(stay, min(slack, stays))
+        out[start + value] = stay
+        novelty = graphs.novelty[pair]
+        scale = (1.0 - novelty) / (total + stay)
+        for k in range(n):
+            out[start + k] = out[start + k] * scale + novelty * graphs.base[start + k]

@@ -6,9 +6,7 @@ one draw among the bits and "none"; where exactly one is on, they are scaled to 
 
 from __future__ import annotations
 
-import numpy as np
-
-from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, distribution, read
+from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints
 from mbagent.models.graphs.units import Layout
 from mbagent_envs._compiled import compiled
 
@@ -23,26 +21,16 @@ def widest(layout: Layout) -> int:
 
 
 @compiled
-def chances(state: Ints, action: int, layout: Layout, graphs: Graphs, on: Bools, out: Floats) -> None:
-    """Writes the rate of every coupled bit to ``out`` [U]; that of a bit without graphs is the bit."""
-    if len(layout.exactly) == 0:
-        return
-    for unit in layout.coupled:
-        out[unit] = read(state, unit, layout)
-    both = np.empty(2, dtype=np.float64)
-    for unit in graphs.changing:
-        if layout.coupling_of[unit] >= 0:
-            distribution(unit, read(state, unit, layout), action, layout, graphs, on, both)
-            out[unit] = both[1]
+def couple(coupling: int, state: Ints, rates: Floats, still: Bools, layout: Layout, graphs: Graphs, out: Floats) -> int:
+    """Writes the probability of each bit of a coupling, and of none, to ``out``; returns how many bits there are.
 
-
-@compiled
-def couple(coupling: int, rates: Floats, layout: Layout, out: Floats) -> int:
-    """Writes the probability of each bit of a coupling, and of none, to ``out``; returns how many bits there are."""
+    ``rates`` are all units' distributions; a bit that is ``still`` [U], without graphs, is as sure as it is in ``state``.
+    """
     first, last = layout.coupled_first[coupling], layout.coupled_first[coupling + 1]
     n, total = last - first, 0.0
     for k in range(n):
-        out[k] = rates[layout.coupled[first + k]]
+        unit = layout.coupled[first + k]
+        out[k] = state[layout.members[layout.first[unit]]] if still[unit] else rates[graphs.start[unit] + 1]
         total += out[k]
     none = 0.0 if layout.exactly[coupling] and total > 1e-9 else max(0.0, 1.0 - total)
     for k in range(n):

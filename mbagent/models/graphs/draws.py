@@ -6,13 +6,13 @@ Shapes: B batch, F factors, U units (the last two are ``terminated`` and the eve
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, distribution, n_columns, read, show, write
-from mbagent.models.graphs.couplings import chances, couple, settle, which, widest
+from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, distributions, n_columns, read, show, write
+from mbagent.models.graphs.couplings import couple, settle, which, widest
 from mbagent.models.graphs.units import Layout
 from mbagent.models.particles import NEGLIGIBLE, Found, begin, new_particles, prune, room, split, used
 from mbagent_envs._compiled import compiled
@@ -21,28 +21,60 @@ from mbagent_envs.random_keys import uniform_at
 Keys: TypeAlias = NDArray[np.uint64]
 
 
+class Work(NamedTuple):
+    """Work space for one row at a time.
+
+    Attributes:
+        on: which columns are on, bool [D].
+        values: of all units, int64 [U].
+        rates: all units' distributions, [sum of cardinalities].
+        still: which units have no graphs, bool [U].
+        joint: the distribution of a coupling, or of a unit.
+    """
+
+    on: Bools
+    values: Ints
+    rates: Floats
+    still: Bools
+    joint: Floats
+
+
+@compiled
+def work_space(layout: Layout, graphs: Graphs) -> Work:
+    """Room for a row."""
+    still = np.ones(len(layout.outputs), dtype=np.bool_)
+    still[graphs.changing] = False
+    return Work(
+        np.empty(n_columns(layout), dtype=np.bool_),
+        np.zeros(len(layout.outputs), dtype=np.int64),
+        np.empty(graphs.start[-1], dtype=np.float64),
+        still,
+        np.empty(widest(layout), dtype=np.float64),
+    )
+
+
 @compiled
 def event_rates(states: Ints, actions: Ints, layout: Layout, graphs: Graphs) -> Floats:
     """Probability of the event, [B]."""
-    rates = np.empty(len(states), dtype=np.float64)
-    on, out = np.empty(n_columns(layout), dtype=np.bool_), np.empty(2, dtype=np.float64)
+    w, rates = work_space(layout, graphs), np.empty(len(states), dtype=np.float64)
+    event = np.array([len(layout.outputs) - 1])
     for b in range(len(states)):
-        show(states[b], actions[b], layout, on)
-        distribution(len(layout.outputs) - 1, 0, actions[b], layout, graphs, on, out)
-        rates[b] = out[1]
+        show(states[b], actions[b], layout, w.on)
+        distributions(event, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
+        rates[b] = w.rates[graphs.start[-1] - 1]
     return rates
 
 
 @compiled
-def _pick(probs: Floats, n: int, u: float, start: int) -> int:
-    """Index drawn from the first ``n`` of ``probs``, or the likeliest where ``u`` is negative; ``start`` where all are 0."""
+def _pick(probs: Floats, start: int, n: int, u: float, otherwise: int) -> int:
+    """Index drawn from ``n`` numbers of ``probs``, or the likeliest where ``u`` is negative."""
     if u < 0.0:
-        return int(np.argmax(probs[:n]))
-    chosen = start
+        return int(np.argmax(probs[start : start + n]))
+    chosen = otherwise
     for k in range(n):
-        if probs[k] > 0.0:
+        if probs[start + k] > 0.0:
             chosen = k
-            u -= probs[k]
+            u -= probs[start + k]
             if u < 0.0:
                 break
     return chosen
@@ -56,53 +88,48 @@ def sample(
 
     ``following`` holds a copy of ``states``; ``greedy`` takes the likeliest value each time instead.
     """
-    n_units, n_couplings = len(layout.outputs), len(layout.exactly)
-    on, rates = np.empty(n_columns(layout), dtype=np.bool_), np.empty(n_units, dtype=np.float64)
-    probs = np.empty(widest(layout), dtype=np.float64)
+    w, n_units = work_space(layout, graphs), len(layout.outputs)
     for b in range(len(states)):
-        show(states[b], actions[b], layout, on)
+        show(states[b], actions[b], layout, w.on)
+        distributions(graphs.changing, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
         terminated[b] = False
         for unit in graphs.changing:
             if layout.coupling_of[unit] >= 0:
                 continue
-            value = read(states[b], unit, layout)
-            distribution(unit, value, actions[b], layout, graphs, on, probs)
-            chosen = _pick(probs, layout.outputs[unit], -1.0 if greedy else uniform_at(keys[b], unit), value)
+            n, start, value = layout.outputs[unit], graphs.start[unit], w.values[unit]
+            u = -1.0 if greedy else uniform_at(keys[b], unit)
+            chosen = _pick(w.rates, start, n, u, value)
             if unit == n_units - 2:
                 terminated[b] = chosen == 1
             elif chosen != value:
-                write(following[b], unit, chosen, layout)
-        chances(states[b], actions[b], layout, graphs, on, rates)
-        for q in range(n_couplings):
-            n = couple(q, rates, layout, probs)
-            settle(following[b], q, _pick(probs, n + 1, -1.0 if greedy else uniform_at(keys[b], n_units + q), n), layout)
+                write(following[b], int(unit), chosen, layout)
+        for q in range(len(layout.exactly)):
+            n = couple(q, states[b], w.rates, w.still, layout, graphs, w.joint)
+            u = -1.0 if greedy else uniform_at(keys[b], n_units + q)
+            settle(following[b], q, _pick(w.joint, 0, n + 1, u, n), layout)
 
 
 @compiled
 def log_prob(states: Ints, actions: Ints, following: Ints, terminated: Bools, layout: Layout, graphs: Graphs) -> Floats:
     """Log-probability [B] of next states [B, F] and ends [B]."""
-    n_units = len(layout.outputs)
-    result = np.zeros(len(states), dtype=np.float64)
-    on, rates = np.empty(n_columns(layout), dtype=np.bool_), np.empty(n_units, dtype=np.float64)
-    probs = np.empty(widest(layout), dtype=np.float64)
-    other = np.empty(states.shape[1], dtype=np.int64)
+    w, n_units, result = work_space(layout, graphs), len(layout.outputs), np.zeros(len(states), dtype=np.float64)
+    other, everything = np.empty(states.shape[1], dtype=np.int64), np.arange(n_units - 1)
     for b in range(len(states)):
-        show(states[b], actions[b], layout, on)
+        show(states[b], actions[b], layout, w.on)
+        distributions(everything, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
         other[:] = states[b]
-        for unit in range(n_units - 1):
+        for unit in everything:
             if layout.coupling_of[unit] >= 0:
                 continue
-            now = read(states[b], unit, layout)
-            then = int(terminated[b]) if unit == n_units - 2 else read(following[b], unit, layout)
-            distribution(unit, now, actions[b], layout, graphs, on, probs)
-            result[b] += math.log(probs[then]) if probs[then] > 0.0 else -math.inf
+            then = int(terminated[b]) if unit == n_units - 2 else read(following[b], int(unit), layout)
+            p = w.rates[graphs.start[unit] + then]
+            result[b] += math.log(p) if p > 0.0 else -math.inf
             if unit < n_units - 2:
-                write(other, unit, then, layout)
-        chances(states[b], actions[b], layout, graphs, on, rates)
+                write(other, int(unit), then, layout)
         for q in range(len(layout.exactly)):
-            couple(q, rates, layout, probs)
+            couple(q, states[b], w.rates, w.still, layout, graphs, w.joint)
             then = which(following[b], q, layout)
-            result[b] += math.log(probs[then]) if then >= 0 and probs[then] > 0.0 else -math.inf
+            result[b] += math.log(w.joint[then]) if then >= 0 and w.joint[then] > 0.0 else -math.inf
             settle(other, q, then, layout)
         if not (other == following[b]).all():  # a group with no bit on, or with several
             result[b] = -math.inf
@@ -112,27 +139,23 @@ def log_prob(states: Ints, actions: Ints, following: Ints, terminated: Bools, la
 @compiled
 def marginals(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, start: Ints, out: Floats) -> None:
     """Writes each factor's distribution to ``out`` [B, sum of cardinalities]; factor f's begins at ``start[f]``."""
-    n_units = len(layout.outputs)
-    on, rates = np.empty(n_columns(layout), dtype=np.bool_), np.empty(n_units, dtype=np.float64)
-    probs = np.empty(widest(layout), dtype=np.float64)
+    w, everything = work_space(layout, graphs), np.arange(len(layout.outputs) - 2)
     for b in range(len(states)):
-        show(states[b], actions[b], layout, on)
-        for unit in range(n_units - 2):
-            if layout.coupling_of[unit] >= 0:
-                continue
+        show(states[b], actions[b], layout, w.on)
+        distributions(everything, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
+        for unit in everything:
             first, last = layout.first[unit], layout.first[unit + 1]
-            distribution(unit, read(states[b], unit, layout), actions[b], layout, graphs, on, probs)
             for k in range(layout.outputs[unit]):
+                p = w.rates[graphs.start[unit] + k]
                 if last - first == 1:
-                    out[b, start[layout.members[first]] + k] = probs[k]
+                    out[b, start[layout.members[first]] + k] = p
                 else:
-                    _write_bit(out[b], start[layout.members[first + k]], probs[k])
-        chances(states[b], actions[b], layout, graphs, on, rates)
+                    _write_bit(out[b], start[layout.members[first + k]], p)
         for q in range(len(layout.exactly)):
-            n = couple(q, rates, layout, probs)
+            n = couple(q, states[b], w.rates, w.still, layout, graphs, w.joint)
             for k in range(n):
                 factor = layout.members[layout.first[layout.coupled[layout.coupled_first[q] + k]]]
-                _write_bit(out[b], start[factor], probs[k])
+                _write_bit(out[b], start[factor], w.joint[k])
 
 
 @compiled
@@ -143,41 +166,47 @@ def _write_bit(out: Floats, start: int, p: float) -> None:
 @compiled
 def successors(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, n_grid: int, key: np.uint64, offset: float) -> Found:
     """Systematic draws through the inverse distribution function, unit after unit; see ``systematic.py``."""
-    n_units, n_couplings = len(layout.outputs), len(layout.exactly)
+    w, n_units, n_couplings, n_changing = (
+        work_space(layout, graphs),
+        len(layout.outputs),
+        len(layout.exactly),
+        len(graphs.changing),
+    )
     p, found = new_particles(n_grid, n_units + n_couplings), room(len(states), n_grid, states.shape[1] + 1)
     still_open, base = np.empty(n_units + n_couplings, dtype=np.int64), np.empty(states.shape[1], dtype=np.int64)
-    on, rates = np.empty(n_columns(layout), dtype=np.bool_), np.empty(n_units, dtype=np.float64)
-    probs = np.empty(widest(layout), dtype=np.float64)
     counts, following, terminated, mass, points = found
     total = 0
     for b in range(len(states)):
-        show(states[b], actions[b], layout, on)
+        show(states[b], actions[b], layout, w.on)
+        distributions(graphs.changing, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
         n_live, n_open, ended = begin(p, n_grid), 0, False
         base[:] = states[b]
-        chances(states[b], actions[b], layout, graphs, on, rates)
-        for i in range(len(graphs.changing) + n_couplings):
-            number = graphs.changing[i] if i < len(graphs.changing) else n_units + i - len(graphs.changing)
+        for i in range(n_changing + n_couplings):
+            number = graphs.changing[i] if i < n_changing else n_units + i - n_changing
             if number == n_units - 1 or (number < n_units and layout.coupling_of[number] >= 0):
                 continue
             if number < n_units:
-                n = layout.outputs[number]
-                distribution(number, read(states[b], number, layout), actions[b], layout, graphs, on, probs)
+                n, start = layout.outputs[number], graphs.start[number]
+                for k in range(n):
+                    w.joint[k] = w.rates[start + k]
+                best, value = _settled(w.joint, n), w.values[number]
             else:
-                n = couple(number - n_units, rates, layout, probs) + 1
-            best = _settled(probs, n)
+                n, value = couple(number - n_units, states[b], w.rates, w.still, layout, graphs, w.joint) + 1, -1
+                best = _settled(w.joint, n)
             if best >= 0:
-                ended = _put(base, number, best, layout, ended)
+                if best != value:
+                    ended = _put(base, number, best, layout, ended)
                 continue
-            prune(probs, n)
+            prune(w.joint, n)
             still_open[n_open] = number
             for q in range(n_live):
-                n_live = split(p, q, n_live, number, n_open, probs, n, n_grid, key, offset)
+                n_live = split(p, q, n_live, number, n_open, w.joint, n, n_grid, key, offset)
             n_open += 1
         counts[b] = n_live
         for q in range(n_live):
             following[total + q], over = base, ended
-            for w in range(n_open):
-                over = _put(following[total + q], still_open[w], p.factors[q, w], layout, over)
+            for v in range(n_open):
+                over = _put(following[total + q], still_open[v], p.factors[q, v], layout, over)
             terminated[total + q], mass[total + q], points[total + q] = over, p.mass[q], p.points[q]
         total += n_live
     return used(found, total)
