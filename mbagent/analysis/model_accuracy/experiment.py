@@ -107,7 +107,8 @@ class Score:
 
     Attributes:
         case, model, seed, steps: which.
-        likeliest: share of judged transitions whose likeliest next state is the one met, in all factors that are certain.
+        likeliest: share of judged transitions whose likeliest next state is the one met, in all factors that are certain; NaN
+            where none is judged.
         sampled: the same of a drawn next state.
         joint: total variation of the joint distribution of next states, exact; NaN where the world lists none or the
             model has no probabilities.
@@ -220,12 +221,13 @@ def _score(model: TransitionModel, true: SimulatorModel, rows: TransitionBatch, 
     began = time.process_time()
     drawn, _ = model.sample(rows.states, rows.actions, derive(1, np.arange(len(rows))))
     each = 1e6 * (time.process_time() - began) / len(rows)
-    hit = ((drawn == rows.next_states) | ~certain).all(axis=1)[judged].mean()
-    likeliest = likeliest_states(model, rows)
-    right = ((likeliest == rows.next_states) | ~certain).all(axis=1)[judged].mean()
+    hit, right = (
+        float(((found == rows.next_states) | ~certain).all(axis=1)[judged].mean()) if judged.any() else NAN
+        for found in (drawn, likeliest_states(model, rows))
+    )
     logs = np.maximum(model.log_prob(rows.states, rows.actions, rows.next_states, rows.terminated), -200.0).mean()
     joint = joint_variation(model, true, rows, order)
-    return Score("", "", 0, 0, float(right), float(hit), joint, float(logs), NAN, each)
+    return Score("", "", 0, 0, right, hit, joint, float(logs), NAN, each)
 
 
 def likeliest_states(model: TransitionModel, rows: TransitionBatch, chunk: int = 10_000) -> States:

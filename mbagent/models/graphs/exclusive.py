@@ -7,11 +7,15 @@ the values of one unit they are drawn jointly, and what the values have in commo
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.base import Bools, States
+
+EXPECTED = 8.0
+"""Two bits must have been expected together this often before "never" is believed: else it may be chance, one in 3,000."""
 
 MOST_ROWS = 50_000
 """Rows that candidates are looked for in; what is found is checked on all."""
@@ -60,7 +64,25 @@ def find_groups(
             free[found[0]] = False
 
 
-def _grow(swaps: NDArray[np.float32], exclusive: Bools, free: Bools) -> NDArray[np.int64]:
+def find_cliques(together: NDArray[np.int64], expected: NDArray[np.float64]) -> list[NDArray[np.int64]]:
+    """Sets of bits of which no two were ever on together after a step though they should have been, were each for itself.
+
+    Args:
+        together: how often two bits were on together, int64 [n, n].
+        expected: how often they should have been by their own probabilities, [n, n].
+    """
+    never = (together == 0) & (expected > EXPECTED)
+    np.fill_diagonal(never, False)
+    strength, cliques = np.where(never, expected, 0.0), []
+    while strength.any():
+        found = np.sort(_grow(strength, never, never.any(axis=0)))
+        cliques.append(found)
+        never[found] = never[:, found] = False
+        strength[found] = strength[:, found] = 0.0
+    return cliques
+
+
+def _grow(swaps: NDArray[np.floating[Any]], exclusive: Bools, free: Bools) -> NDArray[np.int64]:
     """The clique around the strongest swap, in the order found; nothing where there is no swap left."""
     first, second = np.unravel_index(int(swaps.argmax()), swaps.shape)
     if swaps[first, second] == 0:

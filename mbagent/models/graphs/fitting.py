@@ -9,14 +9,28 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent.models.graphs import draws
 from mbagent.models.graphs.compiled import Graphs, build, habit_of
-from mbagent.models.graphs.exclusive import find_groups
+from mbagent.models.graphs.exclusive import find_cliques, find_groups
 from mbagent.models.graphs.greedy import find_splits
 from mbagent.models.graphs.search import Search
-from mbagent.models.graphs.units import Layout, Question, ask, column_kinds, column_table, lay_out, unit_values
+from mbagent.models.graphs.units import (
+    Layout,
+    Question,
+    ask,
+    column_kinds,
+    column_table,
+    coupled_layout,
+    is_lone_bit,
+    lay_out,
+    unit_values,
+)
 from mbagent.transitions import TransitionBatch
 
 Bools: TypeAlias = NDArray[np.bool_]
+
+SOME_ROWS = 4000
+"""Rows on which it is looked at how often bits should be on together."""
 
 
 @dataclass(frozen=True)
@@ -59,11 +73,36 @@ def fit_graphs(cardinalities: Sequence[int], n_actions: int, rows: TransitionBat
     regime = _graphs(
         layout, rows, now, then, {unit: everything if unit == last else usual for unit in range(last + 1)}, usual, True
     )
+    layout = _coupled(layout, regime[0], rows)
     if not events.any():
         return Fitted(layout, regime[0], regime[0], False, *regime[1:])
     rare = np.flatnonzero(events)
     event = _graphs(layout, rows, now, then, dict.fromkeys(range(last), rare), rare, False)
     return Fitted(layout, regime[0], event[0], True, *regime[1:])
+
+
+def _coupled(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Layout:
+    """The layout with those bits coupled that are never on together, though each for itself might be."""
+    bits = graphs.changing[is_lone_bit(layout)[graphs.changing]]
+    if len(bits) < 2 or len(rows) == 0:
+        return layout
+    factors = layout.members[layout.first[bits]]
+    on = rows.next_states[:, factors].astype(np.float32)
+    some = np.linspace(0, len(rows) - 1, min(len(rows), SOME_ROWS)).astype(np.int64)
+    start = np.concatenate([[0], np.cumsum(_cardinalities(layout))]).astype(np.int64)
+    probs = np.empty((len(some), int(start[-1])))
+    draws.marginals(rows.states[some], rows.actions[some], layout, graphs, start, probs)
+    ones = probs[:, start[factors] + 1]
+    expected = ones.T @ ones * (len(rows) / len(some))
+    return coupled_layout(layout, [bits[c] for c in find_cliques(np.rint(on.T @ on).astype(np.int64), expected)])
+
+
+def _cardinalities(layout: Layout) -> NDArray[np.int64]:
+    """Number of values of each factor."""
+    cardinalities = np.full(layout.n_factors, 2, dtype=np.int64)
+    lone = np.flatnonzero(np.diff(layout.first) == 1)
+    cardinalities[layout.members[layout.first[lone]]] = layout.outputs[lone]
+    return cardinalities
 
 
 def _values(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.graphs.compiled import Graphs
-from mbagent.models.graphs.units import Layout, lay_out
+from mbagent.models.graphs.units import Layout, coupled_layout, lay_out
 from mbagent.models.graphs.windows import ACTION, BORDER, CELL, MEETING
 from mbagent.spaces import PlaneLayout
 
@@ -87,9 +87,7 @@ def _couple(layout: Layout, couplings: Sequence[Coupling]) -> Layout:
             of[members] = len(groups)
             groups.append(members)
             exactly.append(coupling.exactly)
-    first = np.concatenate([[0], np.cumsum([len(group) for group in groups])]).astype(np.int64)
-    coupled = np.concatenate([*groups, np.zeros(0, dtype=np.int64)]).astype(np.int64)
-    return layout._replace(coupled_first=first, coupled=coupled, exactly=np.asarray(exactly, dtype=np.bool_), coupling_of=of)
+    return coupled_layout(layout, groups, exactly)
 
 
 class _Board:

@@ -26,7 +26,7 @@ from mbagent.models.graphs.arrays import from_arrays, to_arrays
 from mbagent.models.graphs.compiled import Graphs, build, habit_of, n_columns
 from mbagent.models.graphs.events import flag_events
 from mbagent.models.graphs.fitting import Fitted, fit_graphs
-from mbagent.models.graphs.units import lay_out
+from mbagent.models.graphs.units import coupled_layout, is_lone_bit, lay_out
 from mbagent.models.particles import assemble, rows_at_once, start
 from mbagent.transitions import TransitionBatch, TransitionDataset
 from mbagent_envs.random_keys import derive, uniforms
@@ -214,6 +214,7 @@ class DecisionGraphModel(BaseTransitionModel):
         groups = [(int(unit), int(f)) for unit in grouped for f in layout.members[layout.first[unit] : layout.first[unit + 1]]]
         state: dict[str, NDArray[Any]] = {
             "groups": np.asarray(groups, dtype=np.int64).reshape(-1, 2),
+            "couplings": fitted.layout.coupling_of.copy(),
             "has_event": np.asarray(fitted.has_event),
         }
         for name, graphs in (("usual", fitted.usual), ("event", fitted.event)):
@@ -226,7 +227,12 @@ class DecisionGraphModel(BaseTransitionModel):
         Raises:
             ValueError: the arrays are not those of a model of these factors and actions; nothing is changed then.
         """
-        known = {"groups", "has_event", *(f"{name}.{part}" for name in ("usual", "event") for part in Graphs._fields)}
+        known = {
+            "groups",
+            "couplings",
+            "has_event",
+            *(f"{name}.{part}" for name in ("usual", "event") for part in Graphs._fields),
+        }
         wrong = sorted(known ^ set(state))
         if wrong:
             raise ValueError(f"These weights are not those of a decision graph model (first difference: {wrong[0]!r}).")
@@ -239,6 +245,13 @@ class DecisionGraphModel(BaseTransitionModel):
                 "These weights group other bits than this model has; load them into a model of the same environment."
             )
         layout = lay_out(self.cardinalities, groups, self.n_actions)
+        couplings = np.asarray(state["couplings"], dtype=np.int64).reshape(-1)
+        coupled = np.flatnonzero(couplings >= 0)
+        if len(couplings) != len(layout.outputs) or not is_lone_bit(layout)[coupled].all():
+            raise ValueError(
+                "These weights couple other bits than this model has; load them into a model of the same environment."
+            )
+        layout = coupled_layout(layout, [coupled[couplings[coupled] == q] for q in np.unique(couplings[coupled])])
         usual, event = (
             from_arrays({part: state[f"{name}.{part}"] for part in Graphs._fields}, layout, n_columns(layout))
             for name in ("usual", "event")

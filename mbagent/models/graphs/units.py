@@ -79,6 +79,25 @@ def lay_out(cardinalities: Sequence[int], groups: Sequence[Sequence[int]], n_act
     )
 
 
+def coupled_layout(layout: Layout, couplings: Sequence[Ints], exactly: Sequence[bool] | None = None) -> Layout:
+    """The layout with couplings, each given by its units; exactly one bit of a coupling is on, or at most one (default)."""
+    of = np.full(len(layout.outputs), -1, dtype=np.int64)
+    for number, units in enumerate(couplings):
+        of[units] = number
+    return layout._replace(
+        coupled_first=np.concatenate([[0], np.cumsum([len(units) for units in couplings])]).astype(np.int64),
+        coupled=np.concatenate([*couplings, np.zeros(0, dtype=np.int64)]).astype(np.int64),
+        exactly=np.asarray([False] * len(couplings) if exactly is None else exactly, dtype=np.bool_),
+        coupling_of=of,
+    )
+
+
+def is_lone_bit(layout: Layout) -> Bools:
+    """Which units are a single bit, bool [U]."""
+    result: Bools = (layout.outputs == 2) & (np.diff(layout.first) == 1)
+    return result
+
+
 def unit_values(layout: Layout, states: Ints) -> Ints:
     """Value of each unit of factors, int64 [B, U - 2], in states [B, F]; in a group the first bit that is on counts."""
     values = np.empty((len(states), len(layout.outputs) - 2), dtype=np.int64)

@@ -94,9 +94,10 @@ def test_the_true_model_makes_no_mistake() -> None:
 
 
 def test_a_small_run_is_written_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["--cases", "GeyserRunner, deterministic", "--models", "graphs", "--steps", "1000", "--n-tests", "500"]
+    cases = ["GeyserRunner, deterministic", "GeyserRunner, stochastic"]
+    options = ["--cases", *cases, "--models", "graphs", "--steps", "1000", "--n-tests", "500"]
     assert main([*options, "--workers", "1", "--output", str(tmp_path)]) == 0
-    assert len((tmp_path / "results.csv").read_text(encoding="utf-8").splitlines()) == 2
+    assert len((tmp_path / "results.csv").read_text(encoding="utf-8").splitlines()) == 3
     assert "100.00%" in capsys.readouterr().out
     assert len(CASES) == 9
 

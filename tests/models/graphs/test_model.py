@@ -10,7 +10,7 @@ import pytest
 from mbagent import ModelLearningAgent
 from mbagent.models.graphs import DecisionGraphModel
 from mbagent.transitions import TransitionDataset
-from mbagent_envs import GeyserRunner, Maneuverer
+from mbagent_envs import FlierCatcher, GeyserRunner, Maneuverer
 from mbagent_envs.random_keys import derive
 from tests.models.helpers import dataset, outcomes, played
 
@@ -114,6 +114,17 @@ def test_a_maze_of_flat_bits_in_any_order_is_learned_in_5000_steps() -> None:
     np.testing.assert_allclose(np.bincount(fewer.rows, weights=fewer.probabilities), 1.0)
 
 
+def test_flat_bits_that_exclude_each_other_are_drawn_together() -> None:
+    game = FlierCatcher(height=4, width=4)
+    flat = DecisionGraphModel((2,) * 32, 3)
+    flat.fit(played(game, 4000, 100))
+    rows = played(game, 2000, 100, seed=1).rows()
+    states, _ = flat.sample(rows.states, rows.actions, derive(1, np.arange(2000)))
+    spawned = states.reshape(-1, 2, 4, 4)[:, 1, :, -1].sum(axis=1)
+    assert spawned.max() == 1
+    assert abs(spawned.mean() - 0.4) < 5 * np.sqrt(0.24 / 2000)
+
+
 def test_weights_come_back_and_damaged_ones_are_refused(model: DecisionGraphModel) -> None:
     other = DecisionGraphModel(CARDINALITIES, 2)
     other.load_state_dict(model.state_dict())
@@ -130,6 +141,8 @@ def test_weights_come_back_and_damaged_ones_are_refused(model: DecisionGraphMode
         {**good, "usual.values": good["usual.values"] + 9},
         {**good, "usual.rate": good["usual.rate"] * np.nan},
         {**good, "groups": np.array([[0, 1], [0, 2]])},
+        {**good, "couplings": np.zeros_like(good["couplings"])},
+        {**good, "couplings": good["couplings"][:-1]},
         DecisionGraphModel((2, 2), 2).state_dict(),
     ):
         with pytest.raises(ValueError, match="These weights"):

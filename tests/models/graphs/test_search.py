@@ -5,7 +5,7 @@ import pytest
 from scipy import special
 
 from mbagent.models.graphs.evidence import ALL, SINGLE, Head, best_split, columns_of, evidence, log_gamma_tables
-from mbagent.models.graphs.exclusive import find_groups
+from mbagent.models.graphs.exclusive import find_cliques, find_groups
 from mbagent.models.graphs.greedy import find_splits
 from mbagent.models.graphs.search import Search
 
@@ -99,6 +99,19 @@ def test_groups_of_bits_of_which_one_is_on_are_found_and_no_others() -> None:
     mixed[7, np.flatnonzero(order == 0)] = 1 - mixed[7, np.flatnonzero(order == 0)]  # once, two are on, or none
     assert expected[0] not in find_groups((2,) * 16, mixed[:n], mixed[1:])
     assert find_groups((2, 2), mixed[:0, :2], mixed[:0, :2]) == ()
+
+
+def test_bits_never_on_together_are_told_from_bits_that_seldom_are() -> None:
+    p, n = 0.05, 8000
+    chosen = RNG.integers(20, size=n)  # 0 ... 3: one of four bits that exclude each other; else none of them
+    free = RNG.random((n, 4)) < p
+    table = np.concatenate([chosen[:, None] == np.arange(4), free], axis=1)
+    order = RNG.permutation(8)
+    on = table[:, order].astype(np.int64)
+    expected = np.full((8, 8), n * p * p)
+    cliques = find_cliques(on.T @ on, expected)
+    assert [clique.tolist() for clique in cliques] == [sorted(np.flatnonzero(np.isin(order, range(4))).tolist())]
+    assert find_cliques(on.T @ on, expected / 10) == []  # with less to expect, never is no surprise
 
 
 def test_a_bit_that_goes_out_and_never_comes_on_again_ends_the_search() -> None:
