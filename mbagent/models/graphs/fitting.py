@@ -53,7 +53,9 @@ class Fitted:
     found: Sequence[Search]
 
 
-def fit_graphs(cardinalities: Sequence[int], n_actions: int, rows: TransitionBatch, events: Bools) -> Fitted:
+def fit_graphs(
+    cardinalities: Sequence[int], n_actions: int, rows: TransitionBatch, events: Bools, in_pairs: bool = True
+) -> Fitted:
     """Fits everything.
 
     Args:
@@ -61,6 +63,7 @@ def fit_graphs(cardinalities: Sequence[int], n_actions: int, rows: TransitionBat
         n_actions: number of actions A.
         rows: N transitions.
         events: which of them are rare events, bool [N].
+        in_pairs: whether to look for causes that matter only together, which takes most of the time.
     """
     groups = find_groups(cardinalities, rows.states, rows.next_states, ~events)
     layout = lay_out(cardinalities, groups, n_actions)
@@ -70,14 +73,13 @@ def fit_graphs(cardinalities: Sequence[int], n_actions: int, rows: TransitionBat
     )
     usual, everything = np.flatnonzero(~events), np.arange(len(rows))
     last = len(layout.outputs) - 1
-    regime = _graphs(
-        layout, rows, now, then, {unit: everything if unit == last else usual for unit in range(last + 1)}, usual, True
-    )
+    asked_of = {unit: everything if unit == last else usual for unit in range(last + 1)}
+    regime = _graphs(layout, rows, now, then, asked_of, usual, True, in_pairs)
     layout = _coupled(layout, regime[0], rows)
     if not events.any():
         return Fitted(layout, regime[0], regime[0], False, *regime[1:])
     rare = np.flatnonzero(events)
-    event = _graphs(layout, rows, now, then, dict.fromkeys(range(last), rare), rare, False)
+    event = _graphs(layout, rows, now, then, dict.fromkeys(range(last), rare), rare, False, in_pairs)
     return Fitted(layout, regime[0], event[0], True, *regime[1:])
 
 
@@ -123,6 +125,7 @@ def _graphs(
     asked_of: dict[int, NDArray[np.int64]],
     seen: NDArray[np.int64],
     regular: bool,
+    in_pairs: bool,
 ) -> tuple[Graphs, list[Question], list[Search]]:
     """Graphs of some units, each asked of some rows; ``seen`` are the rows of this regime.
 
@@ -137,7 +140,7 @@ def _graphs(
     ]
     changing = (rows.states[seen] != rows.next_states[seen]).any(axis=0)
     kinds = column_kinds(layout, rows.states[seen], changing)
-    found = find_splits([q.head for q in asked], column_table(layout, rows.states, actions), kinds, layout.n_actions)
+    found = find_splits([q.head for q in asked], column_table(layout, rows.states, actions), kinds, layout.n_actions, in_pairs)
     habits = [
         habit_of(int(cardinality), layout.n_actions, actions[seen], now[seen, unit], then[seen, unit])
         for unit, cardinality in enumerate(outputs)

@@ -19,7 +19,7 @@ MOST_SPLITS = 256
 """Most splits of one head."""
 
 
-def find_splits(heads: Sequence[Head], table: Bools, kinds: Ints, n_actions: int) -> list[Search]:
+def find_splits(heads: Sequence[Head], table: Bools, kinds: Ints, n_actions: int, in_pairs: bool = True) -> list[Search]:
     """The splits of each head, and its rows with the contexts that they lead to.
 
     Args:
@@ -27,6 +27,7 @@ def find_splits(heads: Sequence[Head], table: Bools, kinds: Ints, n_actions: int
         table: columns of all rows, bool [N, D].
         kinds: which kind of thing each column is, int64 [D]; causes of one kind make others of that kind likelier.
         n_actions: number of actions A.
+        in_pairs: whether to look for causes that matter only together, too.
     """
     columns, tables = columns_of(table), log_gamma_tables(len(table) + 1)
     searches = [Search(head) for head in heads]
@@ -39,7 +40,7 @@ def find_splits(heads: Sequence[Head], table: Bools, kinds: Ints, n_actions: int
             for h, chosen in found:
                 searches[h].divide(chosen, table, tables)
                 searches[h].open = len(searches[h].splits) < MOST_SPLITS
-        going = pairs.divide(searches)
+        going = in_pairs and pairs.divide(searches)
     return searches
 
 

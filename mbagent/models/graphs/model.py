@@ -65,23 +65,16 @@ class DecisionGraphModel(BaseTransitionModel):
         began = time.perf_counter()
         train, held_out = data.split(self.validation, seed)
         rows = data.rows()
-        events = flag_events(rows.states, rows.next_states)
-        plain = self._fitted(train, np.zeros(len(train), dtype=np.bool_))
-        best, likelihood = plain, self._likelihood(plain, held_out)
+        events = self._events(rows, train, held_out)
         if progress is not None:
             progress(0.4)
-        if events.any():
-            flagged = self._fitted(train, flag_events(train.states, train.next_states))
-            other = self._likelihood(flagged, held_out)
-            if other > likelihood:
-                best, likelihood = flagged, other
-            else:
-                events[:] = False
+        flagged = flag_events(train.states, train.next_states) & events.any()
+        self.fitted = fit_graphs(self.cardinalities, self.n_actions, train, flagged)
+        likelihood = self._likelihood(self.fitted, held_out)
         if progress is not None:
             progress(0.7)
-        self.fitted = best
         exact = self._exact_match(held_out)
-        self.fitted = self._fitted(rows, events)
+        self.fitted = fit_graphs(self.cardinalities, self.n_actions, rows, events)
         if progress is not None:
             progress(1.0)
         splits = [sum(split.column >= 0 for split in search.splits) for search in self.fitted.found]
@@ -100,8 +93,16 @@ class DecisionGraphModel(BaseTransitionModel):
             },
         )
 
-    def _fitted(self, rows: TransitionBatch, events: Bools) -> Fitted:
-        return fit_graphs(self.cardinalities, self.n_actions, rows, events)
+    def _events(self, rows: TransitionBatch, train: TransitionBatch, held_out: TransitionBatch) -> Bools:
+        """Which rows are rare events; none if held-out transitions are foretold better without."""
+        events, seen = flag_events(rows.states, rows.next_states), flag_events(train.states, train.next_states)
+        if not (events.any() and seen.any()):
+            return np.zeros(len(rows), dtype=np.bool_)
+        with_events, without = (
+            self._likelihood(fit_graphs(self.cardinalities, self.n_actions, train, flags, in_pairs=False), held_out)
+            for flags in (seen, np.zeros_like(seen))
+        )
+        return events if with_events > without else np.zeros_like(events)
 
     def _likelihood(self, fitted: Fitted, rows: TransitionBatch) -> float:
         """Mean log-probability of transitions; the impossible counts as ``IMPOSSIBLE``."""

@@ -66,7 +66,8 @@ class PairSearch:
         for h, search in enumerate(searches):
             if not search.open or self._seen.get(h) == len(search.splits):
                 continue
-            pairs = find_pairs(search.head, self._worth(search, float(prior.max())), self.table, prior, self.tables)
+            worth = self._worth(search, float(prior.max()))
+            pairs = find_pairs(search.head, worth, self.table, prior, self._pattern_prior(), self.tables)
             for pair in pairs:
                 search.divide_by_pair(pair, self.table)
             self._found += pairs
@@ -81,11 +82,20 @@ class PairSearch:
         cost = -(one[e] + one[n - e] - two[n])
         return [int(c) for c in np.argsort(-cost, kind="stable")[:MOST_CONTEXTS] if cost[c] > -most]
 
+    def _pattern_prior(self) -> Floats:
+        """Log probability of each pattern: those found already are likelier."""
+        counts = np.full(len(PATTERNS), 0.2)
+        if len(self._found) >= TELLING:
+            for pair in self._found:
+                counts[PATTERNS.index(pair.pattern)] += 1.0
+        result: Floats = np.log(counts / counts.sum())
+        return result
+
     def _prior(self) -> Floats:
         """Log prior odds of each pair of columns, [D, D]: pairs of a kind already found are likelier, of fresh columns most."""
         n = len(self.kinds)
         if len(self._found) < TELLING:
-            return np.full((n, n), -math.log(max(1.0, len(PATTERNS) * n * (n - 1) / 2)) - FIRST)
+            return np.full((n, n), -math.log(max(1.0, n * (n - 1) / 2)) - FIRST)
         n_kinds = int(self.kinds.max()) + 1
         share, used = np.full((n_kinds, n_kinds), 0.2 / n_kinds**2), np.zeros(n, dtype=np.bool_)
         for pair in self._found:
@@ -100,7 +110,9 @@ class PairSearch:
         return result
 
 
-def find_pairs(head: Head, contexts: Sequence[int], table: Bools, prior: Floats, tables: tuple[Floats, Floats]) -> list[Pair]:
+def find_pairs(
+    head: Head, contexts: Sequence[int], table: Bools, prior: Floats, patterns: Floats, tables: tuple[Floats, Floats]
+) -> list[Pair]:
     """The best pair, and after it further ones in the same context that have no column in common with those before.
 
     Args:
@@ -108,18 +120,21 @@ def find_pairs(head: Head, contexts: Sequence[int], table: Bools, prior: Floats,
         contexts: contexts to look in.
         table: columns of all rows, bool [N, D].
         prior: log prior odds of each pair of columns, [D, D].
+        patterns: log probability of each pattern.
         tables: see ``log_gamma_tables``.
     """
     found: list[Pair] = []
     for context in contexts:
         rows = head.context == context
         if rows.sum() >= FEWEST:
-            found += _in_context(context, table[head.rows[rows]], head.came[rows], prior, tables)
+            found += _in_context(context, table[head.rows[rows]], head.came[rows], prior, patterns, tables)
     best = max(found, default=None)
     return [] if best is None else [pair for pair in found if pair.context == best.context]
 
 
-def _in_context(context: int, table: Bools, came: Ints, prior: Floats, tables: tuple[Floats, Floats]) -> list[Pair]:
+def _in_context(
+    context: int, table: Bools, came: Ints, prior: Floats, patterns: Floats, tables: tuple[Floats, Floats]
+) -> list[Pair]:
     one, two = tables
     on = table.astype(np.float32)
     cells_n, cells_e = _cells(on, np.ones_like(came)), _cells(on, came)
@@ -127,7 +142,7 @@ def _in_context(context: int, table: Bools, came: Ints, prior: Floats, tables: t
     best, which = np.full(prior.shape, -np.inf), np.zeros(prior.shape, dtype=np.int64)
     for number, pattern in enumerate(PATTERNS):
         inside_n, inside_e = _inside(cells_n, pattern), _inside(cells_e, pattern)
-        gain = _evidence(inside_e, inside_n, one, two) + _evidence(e - inside_e, n - inside_n, one, two)
+        gain = patterns[number] + _evidence(inside_e, inside_n, one, two) + _evidence(e - inside_e, n - inside_n, one, two)
         which[gain > best] = number
         np.maximum(best, gain, out=best)
     best += np.triu(prior, 1) - (one[e] + one[n - e] - two[n])
