@@ -85,7 +85,7 @@ def show(scores: list[Score], console: Console) -> None:
             f"{m['fit_seconds']:.1f}",
             f"{m['sample_microseconds']:.1f}",
         ]
-        table.add_row(case, model, f"{steps:,}", *figures)
+        table.add_row(case, model, f"{steps:,}", *("–" if "nan" in figure else figure for figure in figures))
     Console(width=max(console.width, 120)).print(table)
 
 
