@@ -9,15 +9,16 @@ Chickering 1995), which small strengths turn into a preference for pure rows. Sh
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbagent_envs._compiled import compiled
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+Floats: TypeAlias = NDArray[np.float64]
+Ints: TypeAlias = NDArray[np.int64]
+Tables: TypeAlias = tuple[Floats, Floats, Floats]
 
 ALL, ACTION, VALUE, SINGLE = 0, 1, 2, 3
 """Contexts that a split may pool: all, those of one action, those of one present value, or a single one."""
@@ -81,18 +82,36 @@ def columns_of(table: NDArray[np.generic]) -> Columns:
     return Columns(first, column.astype(np.int64), table.shape[1])
 
 
-def log_gamma_tables(n: int, strength: float = STRENGTH) -> tuple[Floats, Floats]:
-    """Return log Gamma(i + s) - log Gamma(s) and log Gamma(i + 2s) - log Gamma(2s) for i = 0 ... n."""
+def evidence_tables(n: int, certain: float = 0.0, strength: float = STRENGTH) -> Tables:
+    """What the evidence of up to ``n`` rows is put together from, see ``evidence``.
+
+    Args:
+        n: rows.
+        certain: probability that a rate is 0 or 1, before any row is seen; else it has the Beta prior.
+        strength: both parameters of the Beta prior.
+    """
     i = np.arange(n)
     one = np.concatenate([[0.0], np.cumsum(np.log(i + strength))])
-    two = np.concatenate([[0.0], np.cumsum(np.log(i + 2.0 * strength))])
-    return one, two
+    two = np.concatenate([[0.0], np.cumsum(np.log(i + 2.0 * strength))]) - np.log1p(-certain)
+    with np.errstate(divide="ignore"):
+        alike = np.logaddexp(np.log(0.5 * certain), one - two)
+    alike[0] = 0.0
+    return one, two, alike
 
 
 @compiled
-def evidence(came: int, n: int, one: Floats, two: Floats) -> float:
+def evidence(came: int, n: int, one: Floats, two: Floats, alike: Floats) -> float:
     """Log marginal likelihood of ``came`` among ``n`` outcomes."""
+    if came == 0 or came == n:
+        return float(alike[n])
     return float(one[came] + one[n - came] - two[n])
+
+
+def evidences(came: Ints, n: Ints, tables: Tables) -> Floats:
+    """As ``evidence``, of many."""
+    one, two, alike = tables
+    result: Floats = np.where((came == 0) | (came == n), alike[n], one[came] + one[n - came] - two[n])
+    return result
 
 
 @compiled
@@ -131,7 +150,7 @@ class Sets(NamedTuple):
 
 
 @compiled
-def _sets(head: Head, n: Ints, e: Ints, one: Floats, two: Floats) -> Sets:
+def _sets(head: Head, n: Ints, e: Ints, one: Floats, two: Floats, alike: Floats) -> Sets:
     n_actions, n_values = head.action.max() + 1, head.value.max() + 1
     n_sets = 2 + n_actions + n_values
     of = np.zeros((len(n), 3), dtype=np.int64)
@@ -140,7 +159,7 @@ def _sets(head: Head, n: Ints, e: Ints, one: Floats, two: Floats) -> Sets:
     rows, came = np.zeros((2, n_sets), dtype=np.int64)
     total, base = np.zeros(n_sets), np.empty(len(n))
     for c in range(len(n)):
-        base[c] = evidence(e[c], n[c], one, two)
+        base[c] = evidence(e[c], n[c], one, two, alike)
         for s in of[c]:
             rows[s] += n[c]
             came[s] += e[c]
@@ -149,7 +168,7 @@ def _sets(head: Head, n: Ints, e: Ints, one: Floats, two: Floats) -> Sets:
 
 
 @compiled
-def best_split(head: Head, columns: Columns, prior: Floats, narrow: Floats, tables: tuple[Floats, Floats]) -> Chosen:
+def best_split(head: Head, columns: Columns, prior: Floats, narrow: Floats, tables: Tables) -> Chosen:
     """The split with the most evidence beyond its price.
 
     On either side of the split, the contexts of the set share one rate or keep a rate each, whichever has more evidence.
@@ -159,11 +178,11 @@ def best_split(head: Head, columns: Columns, prior: Floats, narrow: Floats, tabl
         columns: what may tell them apart.
         prior: log prior odds of each column as a cause in all contexts, [D]; -inf for one that must not be.
         narrow: log prior odds to be added for contexts of one action, of one value, and for a single context, [3].
-        tables: log_gamma_tables of at least R.
+        tables: evidence_tables of at least R.
     """
-    one, two = tables
+    one, two, alike = tables
     n, e, on, came_on = count(head, columns)
-    sets = _sets(head, n, e, one, two)
+    sets = _sets(head, n, e, one, two, alike)
     n_sets = len(sets.n)
     set_n, set_e = np.zeros((2, n_sets), dtype=np.int64)
     inside, outside = np.zeros((2, n_sets))
@@ -175,8 +194,8 @@ def best_split(head: Head, columns: Columns, prior: Floats, narrow: Floats, tabl
         for c in range(len(n)):
             if on[c, b] == 0:
                 continue
-            those = evidence(came_on[c, b], on[c, b], one, two)
-            others = evidence(e[c] - came_on[c, b], n[c] - on[c, b], one, two) - sets.base[c]
+            those = evidence(came_on[c, b], on[c, b], one, two, alike)
+            others = evidence(e[c] - came_on[c, b], n[c] - on[c, b], one, two, alike) - sets.base[c]
             for s in sets.of[c]:
                 set_n[s] += on[c, b]
                 set_e[s] += came_on[c, b]
@@ -188,8 +207,8 @@ def best_split(head: Head, columns: Columns, prior: Floats, narrow: Floats, tabl
         for s in range(n_sets - 1):
             if set_n[s] == 0 or set_n[s] == sets.n[s]:
                 continue
-            gain = max(inside[s], evidence(set_e[s], set_n[s], one, two)) - sets.evidence[s] + prior[b]
-            gain += max(outside[s], evidence(sets.e[s] - set_e[s], sets.n[s] - set_n[s], one, two))
+            gain = max(inside[s], evidence(set_e[s], set_n[s], one, two, alike)) - sets.evidence[s] + prior[b]
+            gain += max(outside[s], evidence(sets.e[s] - set_e[s], sets.n[s] - set_n[s], one, two, alike))
             gain += 0.0 if s == 0 else narrow[0] if s <= sets.n_actions else narrow[1]
             if gain > best:
                 kind = ALL if s == 0 else ACTION if s <= sets.n_actions else VALUE

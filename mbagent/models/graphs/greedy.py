@@ -11,9 +11,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mbagent.models.graphs.evidence import Chosen, Columns, Floats, Head, Ints, best_split, columns_of, log_gamma_tables
+from mbagent.models.graphs.evidence import Chosen, Columns, Floats, Head, Ints, Tables, best_split, columns_of, evidence_tables
+from mbagent.models.graphs.leaves import best_prior
 from mbagent.models.graphs.pairs import FIRST, LEAST, PairSearch
-from mbagent.models.graphs.search import Bools, Search, Tables
+from mbagent.models.graphs.search import Bools, Search
+
+SUREST = 0.99
+"""A rate is believed to be 0 or 1 beforehand with this probability at most."""
 
 MOST_SPLITS = 256
 """Most splits of one head."""
@@ -22,6 +26,8 @@ MOST_SPLITS = 256
 def find_splits(heads: Sequence[Head], table: Bools, kinds: Ints, n_actions: int, in_pairs: bool = True) -> list[Search]:
     """The splits of each head, and its rows with the contexts that they lead to.
 
+    A first search tells how much of this world is certain at all; the second one knows.
+
     Args:
         heads: what is to be explained.
         table: columns of all rows, bool [N, D].
@@ -29,7 +35,15 @@ def find_splits(heads: Sequence[Head], table: Bools, kinds: Ints, n_actions: int
         n_actions: number of actions A.
         in_pairs: whether to look for causes that matter only together, too.
     """
-    columns, tables = columns_of(table), log_gamma_tables(len(table) + 1)
+    columns = columns_of(table)
+    first = _searched(heads, table, columns, kinds, n_actions, evidence_tables(len(table) + 1), False)
+    certain = min(best_prior(first).certain, SUREST)
+    return _searched(heads, table, columns, kinds, n_actions, evidence_tables(len(table) + 1, certain), in_pairs)
+
+
+def _searched(
+    heads: Sequence[Head], table: Bools, columns: Columns, kinds: Ints, n_actions: int, tables: Tables, in_pairs: bool
+) -> list[Search]:
     searches = [Search(head) for head in heads]
     for search in searches:
         search.merge(tables)

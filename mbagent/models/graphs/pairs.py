@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.graphs.evidence import Floats, Head, Ints
-from mbagent.models.graphs.search import Bools, Pair, Search, Tables
+from mbagent.models.graphs.evidence import Floats, Head, Ints, Tables, evidences
+from mbagent.models.graphs.search import Bools, Pair, Search
 
 PATTERNS: tuple[tuple[bool, bool, bool, bool], ...] = (
     (False, False, False, True),
@@ -49,7 +49,7 @@ class PairSearch:
     Args:
         kinds: kind of each column, int64 [D].
         table: columns of all rows, bool [N, D].
-        tables: see ``log_gamma_tables``.
+        tables: see ``evidence_tables``.
     """
 
     def __init__(self, kinds: Ints, table: Bools, tables: Tables) -> None:
@@ -77,9 +77,8 @@ class PairSearch:
 
     def _worth(self, search: Search, most: float) -> list[int]:
         """Contexts whose rows are so mixed that a pair could pay its price, the most mixed first."""
-        one, two = self.tables
         n, e = search.counts()
-        cost = -(one[e] + one[n - e] - two[n])
+        cost = -evidences(e, n, self.tables)
         return [int(c) for c in np.argsort(-cost, kind="stable")[:MOST_CONTEXTS] if cost[c] > -most]
 
     def _pattern_prior(self) -> Floats:
@@ -110,9 +109,7 @@ class PairSearch:
         return result
 
 
-def find_pairs(
-    head: Head, contexts: Sequence[int], table: Bools, prior: Floats, patterns: Floats, tables: tuple[Floats, Floats]
-) -> list[Pair]:
+def find_pairs(head: Head, contexts: Sequence[int], table: Bools, prior: Floats, patterns: Floats, tables: Tables) -> list[Pair]:
     """The best pair, and after it further ones in the same context that have no column in common with those before.
 
     Args:
@@ -121,7 +118,7 @@ def find_pairs(
         table: columns of all rows, bool [N, D].
         prior: log prior odds of each pair of columns, [D, D].
         patterns: log probability of each pattern.
-        tables: see ``log_gamma_tables``.
+        tables: see ``evidence_tables``.
     """
     found: list[Pair] = []
     for context in contexts:
@@ -132,20 +129,17 @@ def find_pairs(
     return [] if best is None else [pair for pair in found if pair.context == best.context]
 
 
-def _in_context(
-    context: int, table: Bools, came: Ints, prior: Floats, patterns: Floats, tables: tuple[Floats, Floats]
-) -> list[Pair]:
-    one, two = tables
+def _in_context(context: int, table: Bools, came: Ints, prior: Floats, patterns: Floats, tables: Tables) -> list[Pair]:
     on = table.astype(np.float32)
     cells_n, cells_e = _cells(on, np.ones_like(came)), _cells(on, came)
     n, e = len(came), int(came.sum())
     best, which = np.full(prior.shape, -np.inf), np.zeros(prior.shape, dtype=np.int64)
     for number, pattern in enumerate(PATTERNS):
         inside_n, inside_e = _inside(cells_n, pattern), _inside(cells_e, pattern)
-        gain = patterns[number] + _evidence(inside_e, inside_n, one, two) + _evidence(e - inside_e, n - inside_n, one, two)
+        gain = patterns[number] + evidences(inside_e, inside_n, tables) + evidences(e - inside_e, n - inside_n, tables)
         which[gain > best] = number
         np.maximum(best, gain, out=best)
-    best += np.triu(prior, 1) - (one[e] + one[n - e] - two[n])
+    best += np.triu(prior, 1) - evidences(np.asarray(e), np.asarray(n), tables)
     best[np.tril_indices(len(best))] = -np.inf
     pairs: list[Pair] = []
     while best.size and (top := float(best.max())) > 0.0:
@@ -172,8 +166,3 @@ def _inside(cells: Sequence[Ints], pattern: Sequence[bool]) -> Ints:
         if chosen:
             total += cell
     return total
-
-
-def _evidence(e: Ints, n: Ints, one: Floats, two: Floats) -> Floats:
-    result: Floats = one[e] + one[n - e] - two[n]
-    return result

@@ -8,10 +8,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.graphs.evidence import ACTION, ALL, SINGLE, VALUE, Chosen, Floats, Head, Ints
+from mbagent.models.graphs.evidence import ACTION, ALL, SINGLE, VALUE, Chosen, Floats, Head, Ints, Tables, evidences
 
 Bools: TypeAlias = NDArray[np.bool_]
-Tables: TypeAlias = tuple[Floats, Floats]
 
 
 class Pair(NamedTuple):
@@ -141,6 +140,5 @@ class Search:
 
 def _share(n: Ints, e: Ints, tables: Tables) -> bool:
     """Whether contexts with these counts have more evidence for one rate than for a rate each."""
-    one, two = tables
-    apart = (one[e] + one[n - e] - two[n]).sum()
-    return bool(one[e.sum()] + one[(n - e).sum()] - two[n.sum()] > apart)
+    pooled = evidences(e.sum(keepdims=True), n.sum(keepdims=True), tables)[0]
+    return bool(pooled > evidences(e, n, tables).sum())
