@@ -260,7 +260,8 @@ def _factor_names(leaves: Sequence[_Leaf], kind: str) -> Iterator[str]:
 def _plane_layout(space: spaces.Space[Any]) -> PlaneLayout | None:
     """The layout if ``space`` is one stack of planes: two or three dimensions, cells at least 3 by 3.
 
-    The channel axis of three dimensions is the first unless the last is strictly the smaller.
+    Of three dimensions, the channel axis is the one whose size differs where the other two (the first two or the last two)
+    are equal; else the first, unless the last is strictly the smaller.
     """
     if not isinstance(space, spaces.MultiBinary | spaces.Box | spaces.MultiDiscrete):
         return None
@@ -269,7 +270,8 @@ def _plane_layout(space: spaces.Space[Any]) -> PlaneLayout | None:
         shape = (1, *shape)
         last = False
     elif len(shape) == 3:
-        last = shape[2] < shape[0]
+        square_first, square_last = shape[0] == shape[1], shape[1] == shape[2]
+        last = square_first if square_first != square_last else shape[2] < shape[0]
     else:
         return None
     channels, height, width = (shape[2], shape[0], shape[1]) if last else shape

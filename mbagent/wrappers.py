@@ -17,10 +17,11 @@ class History(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
     """Makes the last ``k`` observations and actions part of the observation.
 
     For worlds whose next state depends on more than what an observation shows: a model of single steps can then see
-    what it needs. A stack of planes stays one: older observations and one plane for each action become further channels (an
-    action's plane is on everywhere, or off). Any other space becomes one row of variables: the observation's, then, for
-    each step back, the older observation's and one bit for each action. Before the first step the older observations are
-    the first one, and no action is on.
+    what it needs. A stack of planes stays one, channels first: older observations and one plane for each action become
+    further channels (an action's plane is on everywhere, or off). Any other space, and planes of which so many channels could
+    be taken for rows (boards that are not square, with more channels than columns), become one row of variables: the
+    observation's, then, for each step back, the older observation's and one bit for each action. Before the first step
+    the older observations are the first one, and no action is on.
 
     Args:
         env: an environment with discrete spaces (see FactoredSpace).
@@ -41,17 +42,18 @@ class History(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
         self._space, self._actions = FactoredSpace(env.observation_space), ActionEnumeration(env.action_space)
         self._past: deque[tuple[NDArray[np.int64], int]] = deque(maxlen=self.k)
         self._now = np.zeros(len(self._space), dtype=np.int64)
-        planes = self._space.planes
-        if planes is None:
-            bits = (2,) * self._actions.n
-            cards = np.asarray([*self._space.cardinalities, *((*self._space.cardinalities, *bits) * self.k)], dtype=np.int64)
-            self.observation_space = spaces.MultiBinary(len(cards)) if (cards == 2).all() else spaces.MultiDiscrete(cards)
-            return
-        cards = planes.to_planes(np.asarray(self._space.cardinalities)[None])[0]
-        actions = np.full((self._actions.n, planes.height, planes.width), 2, dtype=np.int64)
-        stacked = np.concatenate([cards, *([cards, actions] * self.k)])
-        self._stacked = stacked.shape
-        self.observation_space = spaces.MultiBinary(self._stacked) if (stacked == 2).all() else spaces.MultiDiscrete(stacked)
+        self._planes = self._space.planes
+        if self._planes is not None:
+            cards = self._planes.to_planes(np.asarray(self._space.cardinalities)[None])[0]
+            actions = np.full((self._actions.n, *cards.shape[1:]), 2, dtype=np.int64)
+            self.observation_space = _space_of(np.concatenate([cards, *([cards, actions] * self.k)]))
+            seen = FactoredSpace(self.observation_space).planes
+            if seen is None or seen.channels_last:
+                self._planes = None
+        if self._planes is None:
+            flat = np.asarray(self._space.cardinalities, dtype=np.int64)
+            bits = np.full(self._actions.n, 2, dtype=np.int64)
+            self.observation_space = _space_of(np.concatenate([flat, *([flat, bits] * self.k)]))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -75,7 +77,7 @@ class History(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
 
     def _shown(self) -> NDArray[np.int64]:
         """The observation with its past, newest first."""
-        planes = self._space.planes
+        planes = self._planes
         parts = []
         for factors, action in [(self._now, None), *self._past]:
             parts.append(factors if planes is None else planes.to_planes(factors[None])[0])
@@ -84,6 +86,11 @@ class History(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
                 parts.append(bits if planes is None else np.broadcast_to(bits[:, None, None], (len(bits), *parts[0].shape[1:])))
         shown: NDArray[np.int64] = np.concatenate(parts).astype(self.observation_space.dtype)
         return shown
+
+
+def _space_of(cardinalities: NDArray[np.int64]) -> spaces.MultiBinary | spaces.MultiDiscrete[Any]:
+    """The space of variables with so many values each."""
+    return spaces.MultiBinary(cardinalities.shape) if (cardinalities == 2).all() else spaces.MultiDiscrete(cardinalities)
 
 
 def _batch(value: Any) -> Any:

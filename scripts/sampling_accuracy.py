@@ -48,7 +48,7 @@ class Args:
     """Measure how accurately models sample transition probabilities."""
 
     full: bool = False
-    """All trials with 20 data sets each, 60 of the tiniest, 5 of the largest (about 40 minutes)."""
+    """All trials with 20 data sets each, 60 of the tiniest, 5 of the largest (about an hour)."""
     trials: tuple[str, ...] | None = None
     """Which of 1a, 1b, 2a, 2b, 2c, 3; by default all but 3, with --full all."""
     parts: tuple[Part, ...] | None = None

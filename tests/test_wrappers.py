@@ -10,6 +10,7 @@ from gymnasium.utils.env_checker import check_env
 
 from mbagent import ModelLearningAgent
 from mbagent.models import FitReport
+from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.wrappers import History
 
 ON_WRAPPERS = pytest.mark.filterwarnings("ignore:.*different from the unwrapped version")
@@ -54,10 +55,19 @@ def test_planes_stay_planes() -> None:
     first, _ = env.reset(seed=1)
     np.testing.assert_array_equal(first[:3], first[3:6])
     assert not first[6:].any()
+    assert FactoredSpace(env.observation_space).planes == PlaneLayout(10, 4, 4)  # models see them as planes, too
     second, *_ = env.step(2)
     np.testing.assert_array_equal(second[3:6], first[:3])
     np.testing.assert_array_equal(second[6:].reshape(4, -1).all(axis=1), [False, False, True, False])
     check_env(env, skip_render_check=True)
+
+
+def test_planes_that_would_be_misread_become_a_row() -> None:
+    def shape(k: int) -> tuple[int, ...] | None:
+        return History(gym.make("mbagent/FlierCatcher-v0", height=4, width=6), k).observation_space.shape
+
+    assert shape(1) == (48 + 48 + 3,)  # seven channels of four rows and six columns: the columns would be taken for channels
+    assert shape(3) == (48 + 3 * (48 + 3),)
 
 
 def test_spaces_with_parts_and_wrong_numbers() -> None:

@@ -34,9 +34,10 @@ class BoardWorld(Game):
         n_bits = 3 * self.size**2 + self.n_switches
         super().__init__(observation_shape=(n_bits,), action_names=("up", "right", "down", "left"), goals={})
 
-    @abstractmethod
     def over(self, obs: Bits) -> Bools:
-        """Which states [B, n] are followed by a new layout."""
+        """Which states [B, n] are followed by a new layout: those with a player on the target."""
+        planes = self.planes(obs)
+        return np.asarray((planes[:, 0] & planes[:, 2]).any(axis=1))
 
     @abstractmethod
     def move(self, obs: Bits, actions: Ints, keys: KeyArray) -> Bits:
@@ -98,11 +99,6 @@ class TwoPlayers(BoardWorld):
         luck = uniforms(keys, 3 + self.size**2)
         return self.scatter(luck[:, 3:], tuple(self.cells_of(luck[:, i]) for i in range(3)))
 
-    def over(self, obs: Bits) -> Bools:
-        """See BoardWorld."""
-        planes = self.planes(obs)
-        return np.asarray((planes[:, 0] & planes[:, 2]).any(axis=1))
-
     def move(self, obs: Bits, actions: Ints, keys: KeyArray) -> Bits:
         """See BoardWorld."""
         following = obs.copy()
@@ -160,11 +156,6 @@ class Switch(BoardWorld):
         obs = self.scatter(luck[:, 3:], (self.cells_of(luck[:, 0]), self.cells_of(luck[:, 1])))
         obs[:, -1] = luck[:, 2] < 0.5
         return obs
-
-    def over(self, obs: Bits) -> Bools:
-        """See BoardWorld."""
-        planes = self.planes(obs)
-        return np.asarray((planes[:, 0] & planes[:, 2]).any(axis=1))
 
     def move(self, obs: Bits, actions: Ints, keys: KeyArray) -> Bits:
         """See BoardWorld."""

@@ -88,6 +88,18 @@ class _Nodes:
         return np.asarray(level, dtype=np.int64)
 
 
+def linked(
+    entries: Sequence[tuple[int, int, int]], n_pairs: int, links: Sequence[tuple[int, int, int]]
+) -> tuple[Ints, Ints, Ints, Ints, Ints, Ints]:
+    """The arrays from ``entries`` to ``on`` of Graphs, from entries (pair, value, node) and nodes (column, off, on)."""
+    table = np.asarray(sorted(entries), dtype=np.int64).reshape(-1, 3)
+    parts = np.asarray(links, dtype=np.int64).reshape(-1, 3)
+    begins = np.searchsorted(table[:, 0], np.arange(n_pairs + 1)).astype(np.int64)
+    value, node = np.ascontiguousarray(table[:, 1:].T)
+    column, off, on = np.ascontiguousarray(parts.T)
+    return begins, value, node, column, off, on
+
+
 def build(layout: Layout, asked: Sequence[Question], found: Sequence[Search], habits: Sequence[Habit], still: float) -> Graphs:
     """All graphs.
 
@@ -107,18 +119,11 @@ def build(layout: Layout, asked: Sequence[Question], found: Sequence[Search], ha
             (int(pairs[question.unit] + pair), question.value, int(node))
             for pair, node in zip(question.pairs, first, strict=True)
         ]
-    table = np.asarray(sorted(entries), dtype=np.int64).reshape(-1, 3)
-    links = np.asarray(nodes.links, dtype=np.int64).reshape(-1, 3)
     rates = np.asarray(nodes.rates, dtype=np.float64).reshape(-1, 2)
     return Graphs(
         np.asarray(sorted({question.unit for question in asked}), dtype=np.int64),
         pairs,
-        np.searchsorted(table[:, 0], np.arange(pairs[-1] + 1)).astype(np.int64),
-        np.ascontiguousarray(table[:, 1]),
-        np.ascontiguousarray(table[:, 2]),
-        np.ascontiguousarray(links[:, 0]),
-        np.ascontiguousarray(links[:, 1]),
-        np.ascontiguousarray(links[:, 2]),
+        *linked(entries, int(pairs[-1]), nodes.links),
         np.ascontiguousarray(rates[:, 0]),
         np.ascontiguousarray(rates[:, 1]),
         np.concatenate([habit.stays for habit in habits]),

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.graphs.compiled import Graphs
+from mbagent.models.graphs.compiled import Graphs, linked
 from mbagent.models.graphs.units import Layout, coupled_layout, lay_out
 from mbagent.models.graphs.windows import ACTION, BORDER, CELL, MEETING
 from mbagent.spaces import PlaneLayout
@@ -121,18 +121,12 @@ class _Board:
         for channel in range(len(local.cardinalities)):
             channel_of[layout.cells[channel]] = channel
         channel_of[-1] = len(local.cardinalities) + 1
-        table = np.asarray(sorted(entries), dtype=np.int64).reshape(-1, 3)
-        links, leaves = np.asarray(self.links, dtype=np.int64).reshape(-1, 3), np.asarray(self.leaves, dtype=np.int64)
+        leaves = np.asarray(self.leaves, dtype=np.int64)
         changing = np.flatnonzero(np.isin(channel_of, graphs.changing))
         return Graphs(
             changing.astype(np.int64),
             pairs,
-            np.searchsorted(table[:, 0], np.arange(pairs[-1] + 1)).astype(np.int64),
-            np.ascontiguousarray(table[:, 1]),
-            np.ascontiguousarray(table[:, 2]),
-            np.ascontiguousarray(links[:, 0]),
-            np.ascontiguousarray(links[:, 1]),
-            np.ascontiguousarray(links[:, 2]),
+            *linked(entries, int(pairs[-1]), self.links),
             np.where(leaves >= 0, graphs.rate[leaves], 0.0),
             np.where(leaves >= 0, graphs.spread[leaves], 0.0),
             np.concatenate([graphs.stays[graphs.pairs[c] : graphs.pairs[c + 1]] for c in channel_of]),

@@ -74,21 +74,8 @@ class LocalGraphModel(DecisionGraphModel):
         self._learn(rows)
         if progress is not None:
             progress(1.0)
-        splits = [sum(split.column >= 0 for split in search.splits) for search in self.fitted.found]
-        return FitReport(
-            n_train=len(rows),
-            n_validation=len(held_out),
-            epochs=1,
-            seconds=time.perf_counter() - began,
-            predictor_loss=-likelihood,
-            exact_match=exact,
-            log={
-                "questions": float(len(splits)),
-                "splits": float(np.mean(splits)) if splits else 0.0,
-                "nodes": float(len(self.local.graphs.column)),
-                "couplings": float(len(self.local.couplings)),
-            },
-        )
+        figures = {"nodes": float(len(self.local.graphs.column)), "couplings": float(len(self.local.couplings))}
+        return self._report(began, (len(rows), len(held_out)), likelihood, exact, figures)
 
     def _learn(self, rows: TransitionBatch) -> None:
         """Graphs first, each bit for itself; then what is never on together."""

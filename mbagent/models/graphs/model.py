@@ -42,7 +42,7 @@ class DecisionGraphModel(BaseTransitionModel):
     """Each variable's next value by a small decision graph over the few columns that it hangs on.
 
     Bits of which exactly one is on are drawn as one variable. Rare events that redraw almost everything have graphs of
-    their own, and one for whether they happen. All probabilities are exact; a fit takes well under a second.
+    their own, and one for whether they happen. All probabilities are exact; a fit takes a second or a few.
 
     Args:
         cardinalities: number of values of each state factor, length F.
@@ -77,20 +77,22 @@ class DecisionGraphModel(BaseTransitionModel):
         self.fitted = fit_graphs(self.cardinalities, self.n_actions, rows, events)
         if progress is not None:
             progress(1.0)
+        figures = {"nodes": float(len(self.fitted.usual.column)), "events": float(events.sum())}
+        return self._report(began, (len(rows), len(held_out)), likelihood, exact, figures)
+
+    def _report(
+        self, began: float, sizes: tuple[int, int], likelihood: float, exact: float, figures: Mapping[str, float]
+    ) -> FitReport:
+        """What a fit did; ``sizes`` are the rows fitted to and held out."""
         splits = [sum(split.column >= 0 for split in search.splits) for search in self.fitted.found]
         return FitReport(
-            n_train=len(rows),
-            n_validation=len(held_out),
+            n_train=sizes[0],
+            n_validation=sizes[1],
             epochs=1,
             seconds=time.perf_counter() - began,
             predictor_loss=-likelihood,
             exact_match=exact,
-            log={
-                "questions": float(len(splits)),
-                "splits": float(np.mean(splits)) if splits else 0.0,
-                "nodes": float(len(self.fitted.usual.column)),
-                "events": float(events.sum()),
-            },
+            log={"questions": float(len(splits)), "splits": float(np.mean(splits)) if splits else 0.0, **figures},
         )
 
     def _events(self, rows: TransitionBatch, train: TransitionBatch, held_out: TransitionBatch) -> Bools:
