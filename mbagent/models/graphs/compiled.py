@@ -233,6 +233,14 @@ def n_columns(layout: Layout) -> int:
 
 
 @compiled
+def show_next(following: Ints, asked: Ints, layout: Layout, on: Bools) -> None:
+    """Writes which of the columns ``asked`` [K] of a next state [F] are on, after those of the state in ``on``."""
+    n = n_columns(layout)
+    for column in asked:
+        on[column] = following[layout.factor[column - n]] == layout.value[column - n]
+
+
+@compiled
 def distributions(
     units: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs, on: Bools, values: Ints, out: Floats
 ) -> None:

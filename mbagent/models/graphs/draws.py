@@ -1,6 +1,8 @@
 """Drawing from decision graphs, compiled: next states, probabilities, and successors for planning.
 
-Shapes: B batch, F factors, U units (the last two are ``terminated`` and the event), Q couplings, D columns.
+Units that ``late`` has graphs of are drawn after all others, given what those became (the paper's conditioner, section 3.2,
+asked only where it is needed). Shapes: B batch, F factors, U units (the last two are ``terminated`` and the event),
+Q couplings, D columns, and as many more for the factors' next values.
 """
 
 from __future__ import annotations
@@ -11,10 +13,10 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, distributions, n_columns, read, show, write
+from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, distributions, n_columns, read, show, show_next, write
 from mbagent.models.graphs.couplings import couple, settle, which, widest
 from mbagent.models.graphs.units import Layout
-from mbagent.models.particles import NEGLIGIBLE, Found, begin, new_particles, prune, room, split, used
+from mbagent.models.particles import NEGLIGIBLE, Found, Particles, begin, new_particles, prune, room, split, used
 from mbagent_envs._compiled import compiled
 from mbagent_envs.random_keys import uniform_at
 
@@ -25,10 +27,12 @@ class Work(NamedTuple):
     """Work space for one row at a time.
 
     Attributes:
-        on: which columns are on, bool [D].
+        on: which columns are on, bool [D + D'], those of the next state last.
         values: of all units, int64 [U].
         rates: all units' distributions, [sum of cardinalities].
         still: which units have no graphs, bool [U].
+        later: which units are drawn late, bool [U].
+        asked: columns of the next state that are asked for.
         joint: the distribution of a coupling, or of a unit.
     """
 
@@ -36,27 +40,44 @@ class Work(NamedTuple):
     values: Ints
     rates: Floats
     still: Bools
+    later: Bools
+    asked: Ints
     joint: Floats
 
 
 @compiled
-def work_space(layout: Layout, graphs: Graphs) -> Work:
+def work_space(layout: Layout, graphs: Graphs, late: Graphs) -> Work:
     """Room for a row."""
-    still = np.ones(len(layout.outputs), dtype=np.bool_)
-    still[graphs.changing] = False
+    still, later = np.ones(len(layout.outputs), dtype=np.bool_), np.zeros(len(layout.outputs), dtype=np.bool_)
+    still[graphs.changing], later[late.changing] = False, True
+    n, asked = n_columns(layout), np.zeros(len(layout.factor), dtype=np.bool_)
+    for column in late.column:
+        if column >= n:
+            asked[column - n] = True
     return Work(
-        np.empty(n_columns(layout), dtype=np.bool_),
+        np.empty(n + len(layout.factor), dtype=np.bool_),
         np.zeros(len(layout.outputs), dtype=np.int64),
         np.empty(graphs.start[-1], dtype=np.float64),
         still,
+        later,
+        np.flatnonzero(asked) + n,
         np.empty(widest(layout), dtype=np.float64),
     )
 
 
 @compiled
+def _alone(layout: Layout, graphs: Graphs, later: Bools) -> Ints:
+    """Units with graphs that are drawn each for itself, before those that are drawn late."""
+    chosen = np.zeros(len(layout.outputs), dtype=np.bool_)
+    for unit in graphs.changing:
+        chosen[unit] = layout.coupling_of[unit] < 0 and not later[unit]
+    return np.flatnonzero(chosen)
+
+
+@compiled
 def event_rates(states: Ints, actions: Ints, layout: Layout, graphs: Graphs) -> Floats:
     """Probability of the event, [B]."""
-    w, rates = work_space(layout, graphs), np.empty(len(states), dtype=np.float64)
+    w, rates = work_space(layout, graphs, graphs), np.empty(len(states), dtype=np.float64)
     event = np.array([len(layout.outputs) - 1])
     for b in range(len(states)):
         show(states[b], actions[b], layout, w.on)
@@ -82,41 +103,63 @@ def _pick(probs: Floats, start: int, n: int, u: float, otherwise: int) -> int:
 
 @compiled
 def sample(
-    states: Ints, actions: Ints, keys: Keys, greedy: bool, layout: Layout, graphs: Graphs, following: Ints, terminated: Bools
+    states: Ints,
+    actions: Ints,
+    keys: Keys,
+    greedy: bool,
+    layout: Layout,
+    graphs: Graphs,
+    late: Graphs,
+    following: Ints,
+    terminated: Bools,
 ) -> None:
     """Draws next states into ``following`` [B, F] and ``terminated`` [B], unit u of row b at number u of key b.
 
     ``following`` holds a copy of ``states``; ``greedy`` takes the likeliest value each time instead.
     """
-    w, n_units = work_space(layout, graphs), len(layout.outputs)
+    w, n_units = work_space(layout, graphs, late), len(layout.outputs)
+    early = _alone(layout, graphs, w.later)
     for b in range(len(states)):
         show(states[b], actions[b], layout, w.on)
         distributions(graphs.changing, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
         terminated[b] = False
-        for unit in graphs.changing:
-            if layout.coupling_of[unit] >= 0:
-                continue
-            n, start, value = layout.outputs[unit], graphs.start[unit], w.values[unit]
+        for unit in early:
             u = -1.0 if greedy else uniform_at(keys[b], unit)
-            chosen = _pick(w.rates, start, n, u, value)
-            if unit == n_units - 2:
-                terminated[b] = chosen == 1
-            elif chosen != value:
-                write(following[b], int(unit), chosen, layout)
+            _draw(unit, u, w, layout, graphs, following[b], terminated, b)
         for q in range(len(layout.exactly)):
             n = couple(q, states[b], w.rates, w.still, layout, graphs, w.joint)
             u = -1.0 if greedy else uniform_at(keys[b], n_units + q)
             settle(following[b], q, _pick(w.joint, 0, n + 1, u, n), layout)
+        for i in range(len(late.changing)):
+            show_next(following[b], w.asked, layout, w.on)
+            distributions(late.changing[i : i + 1], states[b], actions[b], layout, late, w.on, w.values, w.rates)
+            u = -1.0 if greedy else uniform_at(keys[b], late.changing[i])
+            _draw(late.changing[i], u, w, layout, late, following[b], terminated, b)
 
 
 @compiled
-def log_prob(states: Ints, actions: Ints, following: Ints, terminated: Bools, layout: Layout, graphs: Graphs) -> Floats:
+def _draw(unit: int, u: float, w: Work, layout: Layout, graphs: Graphs, following: Ints, terminated: Bools, b: int) -> None:
+    """Draws a unit's value into a next state [F], or into ``terminated[b]``."""
+    chosen = _pick(w.rates, graphs.start[unit], layout.outputs[unit], u, w.values[unit])
+    if unit == len(layout.outputs) - 2:
+        terminated[b] = chosen == 1
+    elif chosen != w.values[unit]:
+        write(following, unit, chosen, layout)
+
+
+@compiled
+def log_prob(
+    states: Ints, actions: Ints, following: Ints, terminated: Bools, layout: Layout, graphs: Graphs, late: Graphs
+) -> Floats:
     """Log-probability [B] of next states [B, F] and ends [B]."""
-    w, n_units, result = work_space(layout, graphs), len(layout.outputs), np.zeros(len(states), dtype=np.float64)
+    w, n_units, result = work_space(layout, graphs, late), len(layout.outputs), np.zeros(len(states), dtype=np.float64)
     other, everything = np.empty(states.shape[1], dtype=np.int64), np.arange(n_units - 1)
     for b in range(len(states)):
         show(states[b], actions[b], layout, w.on)
         distributions(everything, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
+        if len(late.changing):
+            show_next(following[b], w.asked, layout, w.on)
+            distributions(late.changing, states[b], actions[b], layout, late, w.on, w.values, w.rates)
         other[:] = states[b]
         for unit in everything:
             if layout.coupling_of[unit] >= 0:
@@ -139,7 +182,7 @@ def log_prob(states: Ints, actions: Ints, following: Ints, terminated: Bools, la
 @compiled
 def marginals(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, start: Ints, out: Floats) -> None:
     """Writes each factor's distribution to ``out`` [B, sum of cardinalities]; factor f's begins at ``start[f]``."""
-    w, everything = work_space(layout, graphs), np.arange(len(layout.outputs) - 2)
+    w, everything = work_space(layout, graphs, graphs), np.arange(len(layout.outputs) - 2)
     for b in range(len(states)):
         show(states[b], actions[b], layout, w.on)
         distributions(everything, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
@@ -164,14 +207,13 @@ def _write_bit(out: Floats, start: int, p: float) -> None:
 
 
 @compiled
-def successors(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, n_grid: int, key: np.uint64, offset: float) -> Found:
+def successors(
+    states: Ints, actions: Ints, layout: Layout, graphs: Graphs, late: Graphs, n_grid: int, key: np.uint64, offset: float
+) -> Found:
     """Systematic draws through the inverse distribution function, unit after unit; see ``systematic.py``."""
-    w, n_units, n_couplings, n_changing = (
-        work_space(layout, graphs),
-        len(layout.outputs),
-        len(layout.exactly),
-        len(graphs.changing),
-    )
+    w, n_units, n_couplings = work_space(layout, graphs, late), len(layout.outputs), len(layout.exactly)
+    single = _alone(layout, graphs, w.later)
+    early = np.concatenate((single[single < n_units - 1], n_units + np.arange(n_couplings)))
     p, found = new_particles(n_grid, n_units + n_couplings), room(len(states), n_grid, states.shape[1] + 1)
     still_open, base = np.empty(n_units + n_couplings, dtype=np.int64), np.empty(states.shape[1], dtype=np.int64)
     counts, following, terminated, mass, points = found
@@ -181,18 +223,13 @@ def successors(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, n_gr
         distributions(graphs.changing, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
         n_live, n_open, ended = begin(p, n_grid), 0, False
         base[:] = states[b]
-        for i in range(n_changing + n_couplings):
-            number = graphs.changing[i] if i < n_changing else n_units + i - n_changing
-            if number == n_units - 1 or (number < n_units and layout.coupling_of[number] >= 0):
-                continue
+        for number in early:
             if number < n_units:
-                n, start = layout.outputs[number], graphs.start[number]
-                for k in range(n):
-                    w.joint[k] = w.rates[start + k]
-                best, value = _settled(w.joint, n), w.values[number]
+                n, start, value = layout.outputs[number], graphs.start[number], w.values[number]
+                w.joint[:n] = w.rates[start : start + n]
             else:
                 n, value = couple(number - n_units, states[b], w.rates, w.still, layout, graphs, w.joint) + 1, -1
-                best = _settled(w.joint, n)
+            best = _settled(w.joint, n)
             if best >= 0:
                 if best != value:
                     ended = _put(base, number, best, layout, ended)
@@ -202,14 +239,34 @@ def successors(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, n_gr
             for q in range(n_live):
                 n_live = split(p, q, n_live, number, n_open, w.joint, n, n_grid, key, offset)
             n_open += 1
+        for i in range(len(late.changing)):
+            number = late.changing[i]
+            n, start = layout.outputs[number], late.start[number]
+            for q in range(n_live):
+                _fill(following[total], base, p, q, still_open, n_open, layout, ended)
+                show_next(following[total], w.asked, layout, w.on)
+                distributions(late.changing[i : i + 1], states[b], actions[b], layout, late, w.on, w.values, w.rates)
+                w.joint[:n] = w.rates[start : start + n]
+                prune(w.joint, n)
+                n_live = split(p, q, n_live, number, n_open, w.joint, n, n_grid, key, offset)
+            still_open[n_open] = number
+            n_open += 1
         counts[b] = n_live
         for q in range(n_live):
-            following[total + q], over = base, ended
-            for v in range(n_open):
-                over = _put(following[total + q], still_open[v], p.factors[q, v], layout, over)
-            terminated[total + q], mass[total + q], points[total + q] = over, p.mass[q], p.points[q]
+            terminated[total + q] = _fill(following[total + q], base, p, q, still_open, n_open, layout, ended)
+            mass[total + q], points[total + q] = p.mass[q], p.points[q]
         total += n_live
     return used(found, total)
+
+
+@compiled
+def _fill(state: Ints, base: Ints, p: Particles, q: int, still_open: Ints, n_open: int, layout: Layout, ended: bool) -> bool:
+    """Writes the next state that a particle stands for; returns whether the episode is over."""
+    state[:] = base
+    over = ended
+    for v in range(n_open):
+        over = _put(state, still_open[v], p.factors[q, v], layout, over)
+    return over
 
 
 @compiled

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mbagent.models.graphs import draws
 from mbagent.models.graphs.compiled import Graphs, build, habit_of
+from mbagent.models.graphs.conditioner import find_dependent
 from mbagent.models.graphs.exclusive import find_cliques, find_groups
 from mbagent.models.graphs.greedy import find_splits
 from mbagent.models.graphs.search import Search
@@ -28,6 +29,7 @@ from mbagent.models.graphs.units import (
 from mbagent.transitions import TransitionBatch
 
 Bools: TypeAlias = NDArray[np.bool_]
+Ints: TypeAlias = NDArray[np.int64]
 
 SOME_ROWS = 4000
 """Rows on which it is looked at how often bits should be on together."""
@@ -39,22 +41,70 @@ class Fitted:
 
     Attributes:
         layout: the units.
-        usual: graphs of all units, and of whether the event happens.
+        usual: graphs of all units, each for itself, and of whether the event happens.
+        late: graphs of the units that are drawn after the others, given what those became, in order.
         event: graphs of what happens in an event; as ``usual`` where there is none.
         has_event: whether there is one.
-        asked, found: questions and splits behind ``usual``.
+        asked, found: questions and splits behind ``usual`` and ``late``.
     """
 
     layout: Layout
     usual: Graphs
+    late: Graphs
     event: Graphs
     has_event: bool
     asked: Sequence[Question]
     found: Sequence[Search]
 
 
+class _Table:
+    """Transitions as units and columns.
+
+    Args:
+        layout: the units.
+        rows: N transitions.
+        events: which of them are rare events, bool [N].
+    """
+
+    def __init__(self, layout: Layout, rows: TransitionBatch, events: Bools) -> None:
+        """See the class."""
+        self.layout, self.rows = layout, rows
+        flags = np.stack([rows.terminated, events], axis=1).astype(np.int64)
+        self.now = np.concatenate([unit_values(layout, rows.states), np.zeros_like(flags)], axis=1)
+        self.then = np.concatenate([unit_values(layout, rows.next_states), flags], axis=1)
+        self.columns = column_table(layout, rows.states, rows.actions)
+
+    def ask(self, unit: int, which: Ints) -> list[Question]:
+        """The questions about a unit, of some rows."""
+        return ask(unit, int(self.layout.outputs[unit]), self.rows.actions, self.now[:, unit], self.then[:, unit], which)
+
+    def kinds(self, seen: Ints) -> Ints:
+        """Kind of each column, by some rows."""
+        changing = (self.rows.states[seen] != self.rows.next_states[seen]).any(axis=0)
+        return column_kinds(self.layout, self.rows.states[seen], changing)
+
+    def build(self, asked: Sequence[Question], found: Sequence[Search], seen: Ints, still: float) -> Graphs:
+        """The graphs; habits are those of the rows seen."""
+        actions, now, then = self.rows.actions[seen], self.now[seen], self.then[seen]
+        habits = [
+            habit_of(int(cardinality), self.layout.n_actions, actions, now[:, unit], then[:, unit])
+            for unit, cardinality in enumerate(self.layout.outputs)
+        ]
+        return build(self.layout, asked, found, habits, still)
+
+
+def nothing_late(graphs: Graphs) -> Graphs:
+    """Graphs of no unit, for where nothing is drawn late."""
+    return graphs._replace(changing=np.zeros(0, dtype=np.int64), column=np.full_like(graphs.column, -1))
+
+
 def fit_graphs(
-    cardinalities: Sequence[int], n_actions: int, rows: TransitionBatch, events: Bools, in_pairs: bool = True
+    cardinalities: Sequence[int],
+    n_actions: int,
+    rows: TransitionBatch,
+    events: Bools,
+    in_pairs: bool = True,
+    jointly: bool = True,
 ) -> Fitted:
     """Fits everything.
 
@@ -64,23 +114,47 @@ def fit_graphs(
         rows: N transitions.
         events: which of them are rare events, bool [N].
         in_pairs: whether to look for causes that matter only together, which takes most of the time.
+        jointly: whether to look for units that hang on what others become.
     """
     groups = find_groups(cardinalities, rows.states, rows.next_states, ~events)
     layout = lay_out(cardinalities, groups, n_actions)
-    now, then = (
-        _values(layout, rows.states, rows, events, before=True),
-        _values(layout, rows.next_states, rows, events, before=False),
-    )
-    usual, everything = np.flatnonzero(~events), np.arange(len(rows))
+    table, usual = _Table(layout, rows, events), np.flatnonzero(~events)
     last = len(layout.outputs) - 1
-    asked_of = {unit: everything if unit == last else usual for unit in range(last + 1)}
-    regime = _graphs(layout, rows, now, then, asked_of, usual, True, in_pairs)
-    layout = _coupled(layout, regime[0], rows)
-    if not events.any():
-        return Fitted(layout, regime[0], regime[0], False, *regime[1:])
-    rare = np.flatnonzero(events)
-    event = _graphs(layout, rows, now, then, dict.fromkeys(range(last), rare), rare, False, in_pairs)
-    return Fitted(layout, regime[0], event[0], True, *regime[1:])
+    asked_of = {unit: np.arange(len(rows)) if unit == last else usual for unit in range(last + 1)}
+    graphs, asked, found = _graphs(table, asked_of, usual, True, in_pairs)
+    layout = _coupled(layout, graphs, rows)
+    late = nothing_late(graphs)
+    if jointly:
+        late, more_asked, more_found = _late_graphs(table, layout, graphs, usual, in_pairs)
+        asked, found = [*asked, *more_asked], [*found, *more_found]
+    event = graphs
+    if events.any():
+        rare = np.flatnonzero(events)
+        event, _, _ = _graphs(table, dict.fromkeys(range(last), rare), rare, False, in_pairs)
+    return Fitted(layout, graphs, late, event, bool(events.any()), asked, found)
+
+
+def _late_graphs(
+    table: _Table, layout: Layout, graphs: Graphs, usual: Ints, in_pairs: bool
+) -> tuple[Graphs, list[Question], list[Search]]:
+    """Graphs of units that hang on what others become, with questions and splits."""
+    rows, kinds, n_columns = table.rows, table.kinds(usual), table.columns.shape[1]
+    late, all_asked, all_found = [], [], []
+    for unit, columns in find_dependent(layout, graphs, rows, usual):
+        asked = table.ask(unit, usual)
+        following = rows.next_states[:, layout.factor[columns]] == layout.value[columns]
+        more_kinds = np.concatenate([kinds, kinds.max(initial=0) + 1 + kinds[columns]])
+        more = np.concatenate([table.columns, following], axis=1)
+        found = find_splits([q.head for q in asked], more, more_kinds, layout.n_actions, in_pairs)
+        if any(split.column >= n_columns for search in found for split in search.splits):
+            numbers = np.concatenate([np.arange(n_columns), n_columns + columns])
+            late.append(unit)
+            all_asked += asked
+            all_found += [search.renamed(numbers) for search in found]
+    if not late:
+        return nothing_late(graphs), [], []
+    built = table.build(all_asked, all_found, usual, float(graphs.still[0]))
+    return built._replace(changing=np.asarray(late, dtype=np.int64)), all_asked, all_found
 
 
 def _coupled(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Layout:
@@ -107,43 +181,15 @@ def _cardinalities(layout: Layout) -> NDArray[np.int64]:
     return cardinalities
 
 
-def _values(
-    layout: Layout, states: NDArray[np.int64], rows: TransitionBatch, events: Bools, *, before: bool
-) -> NDArray[np.int64]:
-    """Values of all units, int64 [N, U], before or after the step."""
-    flags = np.zeros((len(rows), 2), dtype=np.int64)
-    if not before:
-        flags[:, 0], flags[:, 1] = rows.terminated, events
-    return np.concatenate([unit_values(layout, states), flags], axis=1)
-
-
 def _graphs(
-    layout: Layout,
-    rows: TransitionBatch,
-    now: NDArray[np.int64],
-    then: NDArray[np.int64],
-    asked_of: dict[int, NDArray[np.int64]],
-    seen: NDArray[np.int64],
-    regular: bool,
-    in_pairs: bool,
+    table: _Table, asked_of: dict[int, Ints], seen: Ints, regular: bool, in_pairs: bool
 ) -> tuple[Graphs, list[Question], list[Search]]:
     """Graphs of some units, each asked of some rows; ``seen`` are the rows of this regime.
 
     In a ``regular`` regime units that never changed are all taken together for how likely they are to change; where
     anything may change, each for itself.
     """
-    outputs, actions = layout.outputs, rows.actions
-    asked = [
-        question
-        for unit, which in asked_of.items()
-        for question in ask(unit, int(outputs[unit]), actions, now[:, unit], then[:, unit], which)
-    ]
-    changing = (rows.states[seen] != rows.next_states[seen]).any(axis=0)
-    kinds = column_kinds(layout, rows.states[seen], changing)
-    found = find_splits([q.head for q in asked], column_table(layout, rows.states, actions), kinds, layout.n_actions, in_pairs)
-    habits = [
-        habit_of(int(cardinality), layout.n_actions, actions[seen], now[seen, unit], then[seen, unit])
-        for unit, cardinality in enumerate(outputs)
-    ]
-    still = 0.5 / (len(seen) * (len(outputs) if regular else 1) + 1.0)
-    return build(layout, asked, found, habits, still), asked, found
+    asked = [question for unit, which in asked_of.items() for question in table.ask(unit, which)]
+    found = find_splits([q.head for q in asked], table.columns, table.kinds(seen), table.layout.n_actions, in_pairs)
+    still = 0.5 / (len(seen) * (len(table.layout.outputs) if regular else 1) + 1.0)
+    return table.build(asked, found, seen, still), asked, found

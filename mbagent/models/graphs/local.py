@@ -13,11 +13,11 @@ from mbagent.models.base import FitReport, Floats
 from mbagent.models.graphs.arrays import from_arrays, to_arrays
 from mbagent.models.graphs.compiled import Graphs, build, habit_of
 from mbagent.models.graphs.evidence import Ints
-from mbagent.models.graphs.fitting import Fitted
+from mbagent.models.graphs.fitting import Fitted, nothing_late
 from mbagent.models.graphs.greedy import find_splits
 from mbagent.models.graphs.instantiate import COLUMN, ROW, WHOLE, Coupling, LocalGraphs, instantiate
 from mbagent.models.graphs.model import DecisionGraphModel
-from mbagent.models.graphs.search import Search, Split
+from mbagent.models.graphs.search import Search
 from mbagent.models.graphs.units import Question, ask, lay_out
 from mbagent.models.graphs.windows import ACTION, MEETING, column_kinds, column_values, relative_columns
 from mbagent.spaces import FactoredSpace, PlaneLayout
@@ -60,7 +60,7 @@ class LocalGraphModel(DecisionGraphModel):
 
     def _instantiate(self, asked: tuple[Question, ...], found: tuple[Search, ...]) -> None:
         layout, graphs = instantiate(self.local, self.board)
-        self.fitted = Fitted(layout, graphs, graphs, False, asked, found)
+        self.fitted = Fitted(layout, graphs, nothing_late(graphs), graphs, False, asked, found)
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel."""
@@ -170,12 +170,12 @@ def learn_channels(
         habits.append(habit_of(cardinality, n_actions, actions, now, then))
     if asked:
         table = column_values(columns[near], before, rows.actions)
-        found += [_renamed(s, near) for s in find_splits([q.head for q in asked], table, column_kinds(columns)[near], n_actions)]
+        found += [s.renamed(near) for s in find_splits([q.head for q in asked], table, column_kinds(columns)[near], n_actions)]
     ends, nothing = rows.terminated.astype(np.int64), np.zeros(len(rows), dtype=np.int64)
     over = ask(len(cardinalities), 2, rows.actions, nothing, ends, np.arange(len(rows)))
     if over:
         table = _anywhere(columns[far], before, rows)
-        found += [_renamed(s, far) for s in find_splits([q.head for q in over], table, column_kinds(columns)[far], n_actions)]
+        found += [s.renamed(far) for s in find_splits([q.head for q in over], table, column_kinds(columns)[far], n_actions)]
     habits += [habit_of(2, n_actions, rows.actions, nothing, ends), habit_of(2, n_actions, rows.actions, nothing, nothing)]
     still = 0.5 / (len(actions) * len(cardinalities) + 1.0)
     return build(_channels(cardinalities, n_actions), [*asked, *over], found, habits, still), [*asked, *over], found
@@ -186,14 +186,6 @@ def _anywhere(columns: Ints, planes: Ints, rows: TransitionBatch) -> NDArray[np.
     n_cells = planes.shape[2] * planes.shape[3]
     parts = [column_values(columns[d : d + 1], planes, rows.actions)[::n_cells, 0] for d in range(len(columns))]
     return np.stack(parts, axis=1)
-
-
-def _renamed(search: Search, numbers: Ints) -> Search:
-    """A search whose columns get other numbers."""
-    search.splits = [
-        Split(int(numbers[split.column]) if split.column >= 0 else -1, split.off, split.on, split.gain) for split in search.splits
-    ]
-    return search
 
 
 def find_couplings(

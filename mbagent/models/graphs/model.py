@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from mbagent.models.graphs import draws
 from mbagent.models.graphs.arrays import from_arrays, to_arrays
 from mbagent.models.graphs.compiled import Graphs, build, habit_of, n_columns
 from mbagent.models.graphs.events import flag_events
-from mbagent.models.graphs.fitting import Fitted, fit_graphs
+from mbagent.models.graphs.fitting import Fitted, fit_graphs, nothing_late
 from mbagent.models.graphs.units import coupled_layout, is_lone_bit, lay_out
 from mbagent.models.particles import assemble, rows_at_once, start
 from mbagent.transitions import TransitionBatch, TransitionDataset
@@ -58,7 +59,7 @@ class DecisionGraphModel(BaseTransitionModel):
         layout = lay_out(self.cardinalities, (), n_actions)
         none = np.zeros(0, dtype=np.int64)
         nothing = build(layout, (), (), [habit_of(int(n), n_actions, none, none, none) for n in layout.outputs], 1e-9)
-        self.fitted = Fitted(layout, nothing, nothing, False, (), ())
+        self.fitted = Fitted(layout, nothing, nothing_late(nothing), nothing, False, (), ())
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel."""
@@ -70,11 +71,14 @@ class DecisionGraphModel(BaseTransitionModel):
             progress(0.4)
         flagged = flag_events(train.states, train.next_states) & events.any()
         self.fitted = fit_graphs(self.cardinalities, self.n_actions, train, flagged)
-        likelihood = self._likelihood(self.fitted, held_out)
+        likelihood, jointly = self._likelihood(self.fitted, held_out), False
+        if len(self.fitted.late.changing):
+            apart = self._likelihood(replace(self.fitted, late=nothing_late(self.fitted.usual)), held_out)
+            likelihood, jointly = max(likelihood, apart), likelihood > apart
         if progress is not None:
             progress(0.7)
         exact = self._exact_match(held_out)
-        self.fitted = fit_graphs(self.cardinalities, self.n_actions, rows, events)
+        self.fitted = fit_graphs(self.cardinalities, self.n_actions, rows, events, jointly=jointly)
         if progress is not None:
             progress(1.0)
         figures = {"nodes": float(len(self.fitted.usual.column)), "events": float(events.sum())}
@@ -101,7 +105,9 @@ class DecisionGraphModel(BaseTransitionModel):
         if not (events.any() and seen.any()):
             return np.zeros(len(rows), dtype=np.bool_)
         with_events, without = (
-            self._likelihood(fit_graphs(self.cardinalities, self.n_actions, train, flags, in_pairs=False), held_out)
+            self._likelihood(
+                fit_graphs(self.cardinalities, self.n_actions, train, flags, in_pairs=False, jointly=False), held_out
+            )
             for flags in (seen, np.zeros_like(seen))
         )
         return events if with_events > without else np.zeros_like(events)
@@ -138,31 +144,24 @@ class DecisionGraphModel(BaseTransitionModel):
         states, actions = self._rows(states, actions)
         return self._draw(states, actions, as_keys(rng, len(states)))
 
-    def _draw(self, states: States, actions: Actions, keys: Keys) -> tuple[States, Bools]:
+    def _draw(self, states: States, actions: Actions, keys: Keys, greedy: bool = False) -> tuple[States, Bools]:
+        """Draws by keys, or takes the likeliest value of each unit."""
         fitted, following, over = self.fitted, states.copy(), np.zeros(len(states), dtype=np.bool_)
-        draws.sample(states, actions, keys, False, fitted.layout, fitted.usual, following, over)
-        if fitted.has_event:
-            happens = np.flatnonzero(uniforms(derive(keys, _EVENT), 1)[:, 0] < self._event_rates(states, actions))
-            if len(happens):
-                given = states[happens]
-                redrawn, ends = given.copy(), np.zeros(len(happens), dtype=np.bool_)
-                draws.sample(given, actions[happens], keys[happens], False, fitted.layout, fitted.event, redrawn, ends)
-                following[happens], over[happens] = redrawn, ends
+        draws.sample(states, actions, keys, greedy, fitted.layout, fitted.usual, fitted.late, following, over)
+        luck = 0.5 if greedy else uniforms(derive(keys, _EVENT), 1)[:, 0]
+        happens = np.flatnonzero(luck < self._event_rates(states, actions))
+        if len(happens):
+            given, event = states[happens], fitted.event
+            redrawn, ends = given.copy(), np.zeros(len(happens), dtype=np.bool_)
+            late = nothing_late(event)
+            draws.sample(given, actions[happens], keys[happens], greedy, fitted.layout, event, late, redrawn, ends)
+            following[happens], over[happens] = redrawn, ends
         return following, over
 
     def likeliest(self, states: States, actions: Actions) -> tuple[States, Bools]:
         """The likeliest next states, unit by unit, int64 [B, F], and whether they end the episode, bool [B]."""
         states, actions = self._rows(states, actions)
-        following, over = states.copy(), np.zeros(len(states), dtype=np.bool_)
-        keys = np.zeros(len(states), dtype=np.uint64)
-        draws.sample(states, actions, keys, True, self.fitted.layout, self.fitted.usual, following, over)
-        happens = np.flatnonzero(self._event_rates(states, actions) > 0.5)
-        if len(happens):
-            given = states[happens]
-            redrawn, ends = given.copy(), np.zeros(len(happens), dtype=np.bool_)
-            draws.sample(given, actions[happens], keys[happens], True, self.fitted.layout, self.fitted.event, redrawn, ends)
-            following[happens], over[happens] = redrawn, ends
-        return following, over
+        return self._draw(states, actions, np.zeros(len(states), dtype=np.uint64), greedy=True)
 
     def marginals(self, states: States, actions: Actions) -> Floats:
         """See TransitionModel."""
@@ -181,31 +180,34 @@ class DecisionGraphModel(BaseTransitionModel):
         states, actions = self._rows(states, actions)
         following, over = np.ascontiguousarray(next_states, dtype=np.int64), np.ascontiguousarray(terminated, dtype=np.bool_)
         layout = self.fitted.layout
-        usual: Floats = draws.log_prob(states, actions, following, over, layout, self.fitted.usual)
+        usual: Floats = draws.log_prob(states, actions, following, over, layout, self.fitted.usual, self.fitted.late)
         if not self.fitted.has_event:
             return usual
         rate = self._event_rates(states, actions)
-        event = draws.log_prob(states, actions, following, over, layout, self.fitted.event)
+        event = draws.log_prob(states, actions, following, over, layout, self.fitted.event, nothing_late(self.fitted.event))
         with np.errstate(divide="ignore"):
             return np.logaddexp(np.log1p(-rate) + usual, np.log(rate) + event)
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
         """See TransitionModel; systematic draws, see ``models/systematic.py``."""
         states, actions = self._rows(states, actions)
-        usual = self._successors(states, actions, self.fitted.usual, n_samples, seed)
+        usual = self._successors(states, actions, self.fitted.usual, self.fitted.late, n_samples, seed)
         rates = self._event_rates(states, actions)
         happens = np.flatnonzero(rates >= 1.0 / n_samples)
         if len(happens) == 0:
             return usual
-        event = self._successors(states[happens], actions[happens], self.fitted.event, n_samples, seed)
+        late = nothing_late(self.fitted.event)
+        event = self._successors(states[happens], actions[happens], self.fitted.event, late, n_samples, seed)
         return mixed(usual, event, happens, rates)
 
-    def _successors(self, states: States, actions: Actions, graphs: Graphs, n_samples: int, seed: int) -> Successors:
+    def _successors(
+        self, states: States, actions: Actions, graphs: Graphs, late: Graphs, n_samples: int, seed: int
+    ) -> Successors:
         key, offset = start(seed)
-        n_outputs = states.shape[1] + 1
+        layout, n_outputs = self.fitted.layout, states.shape[1] + 1
         step = rows_at_once(n_samples, n_outputs)
         parts = [
-            draws.successors(states[b : b + step], actions[b : b + step], self.fitted.layout, graphs, n_samples, key, offset)
+            draws.successors(states[b : b + step], actions[b : b + step], layout, graphs, late, n_samples, key, offset)
             for b in range(0, len(states), step)
         ]
         return assemble(parts, n_samples, n_outputs)
@@ -220,7 +222,7 @@ class DecisionGraphModel(BaseTransitionModel):
             "couplings": fitted.layout.coupling_of.copy(),
             "has_event": np.asarray(fitted.has_event),
         }
-        for name, graphs in (("usual", fitted.usual), ("event", fitted.event)):
+        for name, graphs in (("usual", fitted.usual), ("late", fitted.late), ("event", fitted.event)):
             state.update({f"{name}.{part}": array for part, array in to_arrays(graphs).items()})
         return state
 
@@ -234,7 +236,7 @@ class DecisionGraphModel(BaseTransitionModel):
             "groups",
             "couplings",
             "has_event",
-            *(f"{name}.{part}" for name in ("usual", "event") for part in Graphs._fields),
+            *(f"{name}.{part}" for name in ("usual", "late", "event") for part in Graphs._fields),
         }
         wrong = sorted(known ^ set(state))
         if wrong:
@@ -255,11 +257,12 @@ class DecisionGraphModel(BaseTransitionModel):
                 "These weights couple other bits than this model has; load them into a model of the same environment."
             )
         layout = coupled_layout(layout, [coupled[couplings[coupled] == q] for q in np.unique(couplings[coupled])])
-        usual, event = (
-            from_arrays({part: state[f"{name}.{part}"] for part in Graphs._fields}, layout, n_columns(layout))
-            for name in ("usual", "event")
+        now, both = n_columns(layout), n_columns(layout) + len(layout.factor)
+        usual, late, event = (
+            from_arrays({part: state[f"{name}.{part}"] for part in Graphs._fields}, layout, n)
+            for name, n in (("usual", now), ("late", both), ("event", now))
         )
-        self.fitted = Fitted(layout, usual, event, bool(state["has_event"]), (), ())
+        self.fitted = Fitted(layout, usual, late, event, bool(state["has_event"]), (), ())
 
 
 def mixed(usual: Successors, event: Successors, happens: NDArray[np.int64], rates: Floats) -> Successors:

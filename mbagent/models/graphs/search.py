@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -113,6 +113,13 @@ class Search:
             target[size] = size if pair.pattern[2 + second] else pair.context
         typical[pair.context], typical[size] = rates
         self._take(Split(pair.second, *targets, 0.0), table[head.rows, pair.second], typical)
+
+    def renamed(self, numbers: Ints) -> Search:
+        """Itself, its columns having got other numbers."""
+        for i, split in enumerate(self.splits):
+            if split.column >= 0:
+                self.splits[i] = replace(split, column=int(numbers[split.column]))
+        return self
 
     def _take(self, split: Split, on: Bools, typical: Floats) -> None:
         head, size = self.head, int(max(split.on.max(), split.off.max())) + 1

@@ -1,0 +1,96 @@
+"""Variables that depend on each other beyond what the present says: asked again, given what earlier ones became.
+
+The paper's conditioner (section 3.2) resamples every variable given all others. Here only those are asked again whose
+errors go together with another's, and, like the causal mask, output i sees y_<i alone, so that probabilities stay exact.
+Whether an episode ended is asked last of all: it mostly hangs on where the step led.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.graphs import draws
+from mbagent.models.graphs.compiled import Graphs
+from mbagent.models.graphs.units import Layout
+from mbagent.transitions import TransitionBatch
+
+Ints: TypeAlias = NDArray[np.int64]
+Bools: TypeAlias = NDArray[np.bool_]
+Floats: TypeAlias = NDArray[np.float64]
+
+UNCERTAIN = 8.0
+"""Variance summed over all rows from which a column counts as uncertain, and two as comparable."""
+
+APART = 6.0
+"""Standard errors that two columns' errors must go together by, beyond what the largest of so many reaches by chance."""
+
+MOST_ENTRIES = 4_000_000
+"""Entries of the table of errors; of more rows, evenly chosen ones are looked at."""
+
+
+class Asked(NamedTuple):
+    """What a unit is asked again with.
+
+    Attributes:
+        unit: its number.
+        columns: columns of the next state, numbered as those of the state.
+    """
+
+    unit: int
+    columns: Ints
+
+
+def probabilities(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Floats:
+    """Probability of each state column after each row, each for itself, [N, D']."""
+    sizes = np.full(layout.n_factors, 2, dtype=np.int64)
+    np.maximum.at(sizes, layout.factor, layout.value + 1)
+    start = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    probs = np.empty((len(rows), int(start[-1])))
+    draws.marginals(rows.states, rows.actions, layout, graphs, start, probs)
+    result: Floats = probs[:, start[layout.factor] + layout.value]
+    return result
+
+
+def find_dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, usual: Ints) -> list[Asked]:
+    """Units to be asked again, in order, with what; ``terminated`` last, with all that changes.
+
+    Args:
+        layout: the units, with their couplings.
+        graphs: of each for itself.
+        rows: N transitions.
+        usual: those that are no rare events, int64 [R].
+    """
+    n_columns, last = len(layout.factor), len(layout.outputs) - 2
+    unit_of = np.empty(layout.n_factors, dtype=np.int64)
+    unit_of[layout.members] = np.repeat(np.arange(len(layout.outputs)), np.diff(layout.first))
+    owner = unit_of[layout.factor]
+    most = max(1000, MOST_ENTRIES // max(n_columns, 1))
+    some = rows.select(usual[np.linspace(0, len(usual) - 1, min(len(usual), most)).astype(np.int64)])
+    found = [Asked(unit, columns) for unit, columns in _dependent(layout, graphs, some, owner).items()]
+    if last in graphs.changing:
+        found.append(Asked(last, np.flatnonzero(np.isin(owner, graphs.changing))))
+    return found
+
+
+def _dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, owner: Ints) -> Mapping[int, Ints]:
+    """Columns of earlier units whose errors go with those of a unit, by unit in ascending order."""
+    if len(rows) == 0 or len(owner) == 0:
+        return {}
+    probs = probabilities(layout, graphs, rows)
+    spread = probs * (1.0 - probs)
+    uncertain = np.flatnonzero(spread.sum(axis=0) > UNCERTAIN)
+    error = (rows.next_states[:, layout.factor[uncertain]] == layout.value[uncertain]) - probs[:, uncertain]
+    variance = spread[:, uncertain].T @ spread[:, uncertain]
+    z = np.abs(error.T @ error) / np.sqrt(np.maximum(variance, 1e-12))
+    unit, coupling = owner[uncertain], layout.coupling_of[owner[uncertain]]
+    earlier = unit[:, None] < unit
+    together = (coupling[:, None] == coupling) & (coupling >= 0)
+    limit = APART + np.sqrt(2.0 * np.log(max(len(uncertain), 2)))
+    goes = earlier & ~together & (variance > UNCERTAIN) & (z > limit) & (coupling < 0)
+    return {
+        int(u): uncertain[goes[:, unit == u].any(axis=1)] for u in np.unique(unit[goes.any(axis=0)]) if goes[:, unit == u].any()
+    }
