@@ -233,11 +233,11 @@ def n_columns(layout: Layout) -> int:
 
 
 @compiled
-def show_next(following: Ints, asked: Ints, layout: Layout, on: Bools) -> None:
-    """Writes which of the columns ``asked`` [K] of a next state [F] are on, after those of the state in ``on``."""
+def show_next(following: Ints, layout: Layout, on: Bools) -> None:
+    """Writes which columns a next state [F] has on, after those of the state in ``on``."""
     n = n_columns(layout)
-    for column in asked:
-        on[column] = following[layout.factor[column - n]] == layout.value[column - n]
+    for column in range(len(layout.factor)):
+        on[n + column] = following[layout.factor[column]] == layout.value[column]
 
 
 @compiled

@@ -1,8 +1,8 @@
-"""Drawing from decision graphs, compiled: next states, probabilities, and successors for planning.
+"""Drawing from decision graphs, compiled: next states and probabilities.
 
-Units that ``late`` has graphs of are drawn after all others, given what those became (the paper's conditioner, section 3.2,
-asked only where it is needed). Shapes: B batch, F factors, U units (the last two are ``terminated`` and the event),
-Q couplings, D columns, and as many more for the factors' next values.
+Units that ``late`` has graphs of are drawn after all others, given what those became (the paper's conditioner, section 3.2);
+only in rows where they are uncertain by themselves, but for whether the episode ended. Shapes: B batch, F factors, U units
+(the last two are ``terminated`` and the event), Q couplings, D columns, D' of them the state's.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, distributions, n_columns, read, show, show_next, write
 from mbagent.models.graphs.couplings import couple, settle, which, widest
 from mbagent.models.graphs.units import Layout
-from mbagent.models.particles import NEGLIGIBLE, Found, Particles, begin, new_particles, prune, room, split, used
+from mbagent.models.particles import NEGLIGIBLE
 from mbagent_envs._compiled import compiled
 from mbagent_envs.random_keys import uniform_at
 
@@ -32,7 +32,7 @@ class Work(NamedTuple):
         rates: all units' distributions, [sum of cardinalities].
         still: which units have no graphs, bool [U].
         later: which units are drawn late, bool [U].
-        asked: columns of the next state that are asked for.
+        shown: where each factor's columns begin among the state's, int64 [F + 1].
         joint: the distribution of a coupling, or of a unit.
     """
 
@@ -41,7 +41,7 @@ class Work(NamedTuple):
     rates: Floats
     still: Bools
     later: Bools
-    asked: Ints
+    shown: Ints
     joint: Floats
 
 
@@ -50,23 +50,19 @@ def work_space(layout: Layout, graphs: Graphs, late: Graphs) -> Work:
     """Room for a row."""
     still, later = np.ones(len(layout.outputs), dtype=np.bool_), np.zeros(len(layout.outputs), dtype=np.bool_)
     still[graphs.changing], later[late.changing] = False, True
-    n, asked = n_columns(layout), np.zeros(len(layout.factor), dtype=np.bool_)
-    for column in late.column:
-        if column >= n:
-            asked[column - n] = True
     return Work(
-        np.empty(n + len(layout.factor), dtype=np.bool_),
+        np.empty(n_columns(layout) + len(layout.factor), dtype=np.bool_),
         np.zeros(len(layout.outputs), dtype=np.int64),
         np.empty(graphs.start[-1], dtype=np.float64),
         still,
         later,
-        np.flatnonzero(asked) + n,
+        np.searchsorted(layout.factor, np.arange(layout.n_factors + 1)),
         np.empty(widest(layout), dtype=np.float64),
     )
 
 
 @compiled
-def _alone(layout: Layout, graphs: Graphs, later: Bools) -> Ints:
+def alone(layout: Layout, graphs: Graphs, later: Bools) -> Ints:
     """Units with graphs that are drawn each for itself, before those that are drawn late."""
     chosen = np.zeros(len(layout.outputs), dtype=np.bool_)
     for unit in graphs.changing:
@@ -118,7 +114,7 @@ def sample(
     ``following`` holds a copy of ``states``; ``greedy`` takes the likeliest value each time instead.
     """
     w, n_units = work_space(layout, graphs, late), len(layout.outputs)
-    early = _alone(layout, graphs, w.later)
+    early = alone(layout, graphs, w.later)
     for b in range(len(states)):
         show(states[b], actions[b], layout, w.on)
         distributions(graphs.changing, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
@@ -130,11 +126,31 @@ def sample(
             n = couple(q, states[b], w.rates, w.still, layout, graphs, w.joint)
             u = -1.0 if greedy else uniform_at(keys[b], n_units + q)
             settle(following[b], q, _pick(w.joint, 0, n + 1, u, n), layout)
+        if len(late.changing):
+            show_next(following[b], layout, w.on)
         for i in range(len(late.changing)):
-            show_next(following[b], w.asked, layout, w.on)
-            distributions(late.changing[i : i + 1], states[b], actions[b], layout, late, w.on, w.values, w.rates)
-            u = -1.0 if greedy else uniform_at(keys[b], late.changing[i])
-            _draw(late.changing[i], u, w, layout, late, following[b], terminated, b)
+            unit = late.changing[i]
+            if is_late(unit, w.rates, layout, graphs):
+                distributions(late.changing[i : i + 1], states[b], actions[b], layout, late, w.on, w.values, w.rates)
+            u = -1.0 if greedy else uniform_at(keys[b], unit)
+            _draw(unit, u, w, layout, late, following[b], terminated, b)
+            _show_unit(unit, following[b], w, layout)
+
+
+@compiled
+def is_late(unit: int, rates: Floats, layout: Layout, graphs: Graphs) -> bool:
+    """Whether a unit that has late graphs needs them here, by its rates without."""
+    return unit == len(layout.outputs) - 2 or settled(rates, graphs.start[unit], layout.outputs[unit]) < 0
+
+
+@compiled
+def _show_unit(unit: int, following: Ints, w: Work, layout: Layout) -> None:
+    """Shows what a unit became."""
+    n = n_columns(layout)
+    for member in range(layout.first[unit], layout.first[unit + 1]):
+        factor = layout.members[member]
+        for column in range(w.shown[factor], w.shown[factor + 1]):
+            w.on[n + column] = following[factor] == layout.value[column]
 
 
 @compiled
@@ -158,8 +174,10 @@ def log_prob(
         show(states[b], actions[b], layout, w.on)
         distributions(everything, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
         if len(late.changing):
-            show_next(following[b], w.asked, layout, w.on)
-            distributions(late.changing, states[b], actions[b], layout, late, w.on, w.values, w.rates)
+            show_next(following[b], layout, w.on)
+        for i in range(len(late.changing)):
+            if is_late(late.changing[i], w.rates, layout, graphs):
+                distributions(late.changing[i : i + 1], states[b], actions[b], layout, late, w.on, w.values, w.rates)
         other[:] = states[b]
         for unit in everything:
             if layout.coupling_of[unit] >= 0:
@@ -207,89 +225,25 @@ def _write_bit(out: Floats, start: int, p: float) -> None:
 
 
 @compiled
-def successors(
-    states: Ints, actions: Ints, layout: Layout, graphs: Graphs, late: Graphs, n_grid: int, key: np.uint64, offset: float
-) -> Found:
-    """Systematic draws through the inverse distribution function, unit after unit; see ``systematic.py``."""
-    w, n_units, n_couplings = work_space(layout, graphs, late), len(layout.outputs), len(layout.exactly)
-    single = _alone(layout, graphs, w.later)
-    early = np.concatenate((single[single < n_units - 1], n_units + np.arange(n_couplings)))
-    p, found = new_particles(n_grid, n_units + n_couplings), room(len(states), n_grid, states.shape[1] + 1)
-    still_open, base = np.empty(n_units + n_couplings, dtype=np.int64), np.empty(states.shape[1], dtype=np.int64)
-    counts, following, terminated, mass, points = found
-    total = 0
-    for b in range(len(states)):
-        show(states[b], actions[b], layout, w.on)
-        distributions(graphs.changing, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
-        n_live, n_open, ended = begin(p, n_grid), 0, False
-        base[:] = states[b]
-        for number in early:
-            if number < n_units:
-                n, start, value = layout.outputs[number], graphs.start[number], w.values[number]
-                w.joint[:n] = w.rates[start : start + n]
-            else:
-                n, value = couple(number - n_units, states[b], w.rates, w.still, layout, graphs, w.joint) + 1, -1
-            best = _settled(w.joint, n)
-            if best >= 0:
-                if best != value:
-                    ended = _put(base, number, best, layout, ended)
-                continue
-            prune(w.joint, n)
-            still_open[n_open] = number
-            for q in range(n_live):
-                n_live = split(p, q, n_live, number, n_open, w.joint, n, n_grid, key, offset)
-            n_open += 1
-        for i in range(len(late.changing)):
-            number = late.changing[i]
-            n, start = layout.outputs[number], late.start[number]
-            for q in range(n_live):
-                _fill(following[total], base, p, q, still_open, n_open, layout, ended)
-                show_next(following[total], w.asked, layout, w.on)
-                distributions(late.changing[i : i + 1], states[b], actions[b], layout, late, w.on, w.values, w.rates)
-                w.joint[:n] = w.rates[start : start + n]
-                prune(w.joint, n)
-                n_live = split(p, q, n_live, number, n_open, w.joint, n, n_grid, key, offset)
-            still_open[n_open] = number
-            n_open += 1
-        counts[b] = n_live
-        for q in range(n_live):
-            terminated[total + q] = _fill(following[total + q], base, p, q, still_open, n_open, layout, ended)
-            mass[total + q], points[total + q] = p.mass[q], p.points[q]
-        total += n_live
-    return used(found, total)
-
-
-@compiled
-def _fill(state: Ints, base: Ints, p: Particles, q: int, still_open: Ints, n_open: int, layout: Layout, ended: bool) -> bool:
-    """Writes the next state that a particle stands for; returns whether the episode is over."""
-    state[:] = base
-    over = ended
-    for v in range(n_open):
-        over = _put(state, still_open[v], p.factors[q, v], layout, over)
-    return over
-
-
-@compiled
-def _put(state: Ints, number: int, value: int, layout: Layout, ended: bool) -> bool:
-    """Gives a unit or coupling its value in a next state; returns whether the episode is over."""
-    n_units = len(layout.outputs)
-    if number == n_units - 2:
-        return value == 1
-    if number >= n_units:
-        settle(state, number - n_units, value, layout)
-    else:
-        write(state, number, value, layout)
-    return ended
-
-
-@compiled
-def _settled(probs: Floats, n: int) -> int:
-    """The only value worth drawing, or -1."""
+def settled(probs: Floats, start: int, n: int) -> int:
+    """The only one of ``n`` values worth drawing, or -1."""
     best = 0
     for k in range(1, n):
-        if probs[k] > probs[best]:
+        if probs[start + k] > probs[start + best]:
             best = k
     for k in range(n):
-        if k != best and probs[k] >= NEGLIGIBLE * probs[best]:
+        if k != best and probs[start + k] >= NEGLIGIBLE * probs[start + best]:
             return -1
     return best
+
+
+@compiled
+def uncertain(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, units: Ints) -> Bools:
+    """In which rows some units need their late graphs, bool [B, len(units)]."""
+    w, result = work_space(layout, graphs, graphs), np.zeros((len(states), len(units)), dtype=np.bool_)
+    for b in range(len(states)):
+        show(states[b], actions[b], layout, w.on)
+        distributions(units, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
+        for i in range(len(units)):
+            result[b, i] = is_late(units[i], w.rates, layout, graphs)
+    return result

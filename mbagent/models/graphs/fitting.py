@@ -141,7 +141,8 @@ def _late_graphs(
     rows, kinds, n_columns = table.rows, table.kinds(usual), table.columns.shape[1]
     late, all_asked, all_found = [], [], []
     for unit, columns in find_dependent(layout, graphs, rows, usual):
-        asked = table.ask(unit, usual)
+        needed = draws.uncertain(rows.states[usual], rows.actions[usual], layout, graphs, np.asarray([unit]))
+        asked = table.ask(unit, usual[needed[:, 0]])
         following = rows.next_states[:, layout.factor[columns]] == layout.value[columns]
         more_kinds = np.concatenate([kinds, kinds.max(initial=0) + 1 + kinds[columns]])
         more = np.concatenate([table.columns, following], axis=1)

@@ -27,6 +27,7 @@ from mbagent.models.graphs.arrays import from_arrays, to_arrays
 from mbagent.models.graphs.compiled import Graphs, build, habit_of, n_columns
 from mbagent.models.graphs.events import flag_events
 from mbagent.models.graphs.fitting import Fitted, fit_graphs, nothing_late
+from mbagent.models.graphs.listing import successors
 from mbagent.models.graphs.units import coupled_layout, is_lone_bit, lay_out
 from mbagent.models.particles import assemble, rows_at_once, start
 from mbagent.transitions import TransitionBatch, TransitionDataset
@@ -207,7 +208,7 @@ class DecisionGraphModel(BaseTransitionModel):
         layout, n_outputs = self.fitted.layout, states.shape[1] + 1
         step = rows_at_once(n_samples, n_outputs)
         parts = [
-            draws.successors(states[b : b + step], actions[b : b + step], layout, graphs, late, n_samples, key, offset)
+            successors(states[b : b + step], actions[b : b + step], layout, graphs, late, n_samples, key, offset)
             for b in range(0, len(states), step)
         ]
         return assemble(parts, n_samples, n_outputs)
