@@ -55,6 +55,17 @@ def probabilities(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Floa
     return result
 
 
+def go_together(error: Floats, other: Floats, spread: Floats, other_spread: Floats, n_tried: int) -> bool:
+    """Whether two columns' errors [...] go together, given their variances [...], one of ``n_tried`` such questions."""
+    return bool(_telling(np.asarray((error * other).sum()), np.asarray((spread * other_spread).sum()), n_tried))
+
+
+def _telling(products: Floats, variances: Floats, n_tried: int) -> Bools:
+    limit = APART + np.sqrt(2.0 * np.log(max(n_tried, 2)))
+    result: Bools = (variances > UNCERTAIN) & (np.abs(products) > limit * np.sqrt(variances))
+    return result
+
+
 def find_dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, usual: Ints) -> list[Asked]:
     """Units to be asked again, in order, with what; ``terminated`` last, with all that changes.
 
@@ -85,12 +96,10 @@ def _dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, owner: Int
     uncertain = np.flatnonzero(spread.sum(axis=0) > UNCERTAIN)
     error = (rows.next_states[:, layout.factor[uncertain]] == layout.value[uncertain]) - probs[:, uncertain]
     variance = spread[:, uncertain].T @ spread[:, uncertain]
-    z = np.abs(error.T @ error) / np.sqrt(np.maximum(variance, 1e-12))
     unit, coupling = owner[uncertain], layout.coupling_of[owner[uncertain]]
     earlier = unit[:, None] < unit
     together = (coupling[:, None] == coupling) & (coupling >= 0)
-    limit = APART + np.sqrt(2.0 * np.log(max(len(uncertain), 2)))
-    goes = earlier & ~together & (variance > UNCERTAIN) & (z > limit) & (coupling < 0)
+    goes = earlier & ~together & (coupling < 0) & _telling(error.T @ error, variance, len(uncertain))
     return {
         int(u): uncertain[goes[:, unit == u].any(axis=1)] for u in np.unique(unit[goes.any(axis=0)]) if goes[:, unit == u].any()
     }

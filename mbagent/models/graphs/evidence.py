@@ -42,17 +42,19 @@ class Columns(NamedTuple):
 
 
 class Head(NamedTuple):
-    """Rows in which one value of one unit is possible, and whether it came.
+    """Rows in which one value of one unit is possible, and how often it came; rows that look alike are one row here.
 
     Attributes:
         rows: numbers of rows, int64 [R].
-        came: 0 or 1, int64 [R].
+        seen: how often each was met, int64 [R].
+        came: how often the value came then, int64 [R].
         context: int64 [R], 0 ... C - 1.
         action: of each context, int64 [C]; -1 where contexts of several actions were merged.
         value: of the unit in each context, int64 [C]; -1 likewise.
     """
 
     rows: Ints
+    seen: Ints
     came: Ints
     context: Ints
     action: Ints
@@ -114,20 +116,34 @@ def evidences(came: Ints, n: Ints, tables: Tables) -> Floats:
     return result
 
 
+class Tally(NamedTuple):
+    """What a head's rows come to.
+
+    Attributes:
+        n, e: rows and arrivals of each context, int64 [C].
+        on, came_on: those with each column on, int64 [C, D].
+    """
+
+    n: Ints
+    e: Ints
+    on: Ints
+    came_on: Ints
+
+
 @compiled
-def count(head: Head, columns: Columns) -> tuple[Ints, Ints, Ints, Ints]:
-    """Rows and arrivals of each context [C], and those with each column on [C, D]."""
+def count(head: Head, columns: Columns) -> Tally:
+    """Counts rows and arrivals of each context, with each column on."""
     n_contexts = len(head.action)
     n, e = np.zeros((2, n_contexts), dtype=np.int64)
     on, came_on = np.zeros((2, n_contexts, columns.n_columns), dtype=np.int64)
     for r in range(len(head.rows)):
-        context, came = head.context[r], head.came[r]
-        n[context] += 1
+        context, seen, came = head.context[r], head.seen[r], head.came[r]
+        n[context] += seen
         e[context] += came
         for j in range(columns.first[head.rows[r]], columns.first[head.rows[r] + 1]):
-            on[context, columns.column[j]] += 1
+            on[context, columns.column[j]] += seen
             came_on[context, columns.column[j]] += came
-    return n, e, on, came_on
+    return Tally(n, e, on, came_on)
 
 
 class Sets(NamedTuple):
@@ -168,26 +184,26 @@ def _sets(head: Head, n: Ints, e: Ints, one: Floats, two: Floats, alike: Floats)
 
 
 @compiled
-def best_split(head: Head, columns: Columns, prior: Floats, narrow: Floats, tables: Tables) -> Chosen:
+def best_split(head: Head, tally: Tally, prior: Floats, narrow: Floats, tables: Tables) -> Chosen:
     """The split with the most evidence beyond its price.
 
     On either side of the split, the contexts of the set share one rate or keep a rate each, whichever has more evidence.
 
     Args:
         head: the rows, with at least two outcomes that differ.
-        columns: what may tell them apart.
+        tally: their counts.
         prior: log prior odds of each column as a cause in all contexts, [D]; -inf for one that must not be.
         narrow: log prior odds to be added for contexts of one action, of one value, and for a single context, [3].
         tables: evidence_tables of at least R.
     """
     one, two, alike = tables
-    n, e, on, came_on = count(head, columns)
+    n, e, on, came_on = tally
     sets = _sets(head, n, e, one, two, alike)
     n_sets = len(sets.n)
     set_n, set_e = np.zeros((2, n_sets), dtype=np.int64)
     inside, outside = np.zeros((2, n_sets))
     best, kind, which, chosen = 0.0, 0, 0, 0
-    for b in range(columns.n_columns):
+    for b in range(on.shape[1]):
         if prior[b] == -math.inf:
             continue
         set_n[:], set_e[:], inside[:], outside[:] = 0, 0, 0.0, sets.evidence

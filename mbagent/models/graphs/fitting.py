@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -18,10 +18,12 @@ from mbagent.models.graphs.search import Search
 from mbagent.models.graphs.units import (
     Layout,
     Question,
+    Seen,
     ask,
     column_kinds,
     column_table,
     coupled_layout,
+    distinct,
     is_lone_bit,
     lay_out,
     unit_values,
@@ -72,11 +74,16 @@ class _Table:
         flags = np.stack([rows.terminated, events], axis=1).astype(np.int64)
         self.now = np.concatenate([unit_values(layout, rows.states), np.zeros_like(flags)], axis=1)
         self.then = np.concatenate([unit_values(layout, rows.next_states), flags], axis=1)
-        self.columns = column_table(layout, rows.states, rows.actions)
+        first, self.pattern = distinct(np.concatenate([rows.states, rows.actions[:, None]], axis=1))
+        self.first, self.columns = first, column_table(layout, rows.states[first], rows.actions[first])
 
     def ask(self, unit: int, which: Ints) -> list[Question]:
         """The questions about a unit, of some rows."""
-        return ask(unit, int(self.layout.outputs[unit]), self.rows.actions, self.now[:, unit], self.then[:, unit], which)
+        return ask(unit, int(self.layout.outputs[unit]), self.seen(unit).select(which))
+
+    def seen(self, unit: int) -> Seen:
+        """A unit's values in all rows."""
+        return Seen(self.pattern, self.rows.actions, self.now[:, unit], self.then[:, unit])
 
     def kinds(self, seen: Ints) -> Ints:
         """Kind of each column, by some rows."""
@@ -141,11 +148,13 @@ def _late_graphs(
     rows, kinds, n_columns = table.rows, table.kinds(usual), table.columns.shape[1]
     late, all_asked, all_found = [], [], []
     for unit, columns in find_dependent(layout, graphs, rows, usual):
-        needed = draws.uncertain(rows.states[usual], rows.actions[usual], layout, graphs, np.asarray([unit]))
-        asked = table.ask(unit, usual[needed[:, 0]])
-        following = rows.next_states[:, layout.factor[columns]] == layout.value[columns]
+        needed = draws.uncertain(rows.states[usual], rows.actions[usual], layout, graphs, np.asarray([unit]))[:, 0]
+        some = table.seen(unit).select(usual[needed])
+        following = rows.next_states[usual[needed]][:, layout.factor[columns]] == layout.value[columns]
+        first, pattern = distinct(np.concatenate([some.pattern[:, None], following], axis=1))
+        asked = ask(unit, int(layout.outputs[unit]), replace(some, pattern=pattern))
         more_kinds = np.concatenate([kinds, kinds.max(initial=0) + 1 + kinds[columns]])
-        more = np.concatenate([table.columns, following], axis=1)
+        more = np.concatenate([table.columns[some.pattern[first]], following[first]], axis=1)
         found = find_splits([q.head for q in asked], more, more_kinds, layout.n_actions, in_pairs)
         if any(split.column >= n_columns for search in found for split in search.splits):
             numbers = np.concatenate([np.arange(n_columns), n_columns + columns])

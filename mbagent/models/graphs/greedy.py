@@ -30,15 +30,16 @@ def find_splits(heads: Sequence[Head], table: Bools, kinds: Ints, n_actions: int
 
     Args:
         heads: what is to be explained.
-        table: columns of all rows, bool [N, D].
+        table: columns of all rows that look different, bool [N, D].
         kinds: which kind of thing each column is, int64 [D]; causes of one kind make others of that kind likelier.
         n_actions: number of actions A.
         in_pairs: whether to look for causes that matter only together, too.
     """
     columns = columns_of(table)
-    first = _searched(heads, table, columns, kinds, n_actions, evidence_tables(len(table) + 1), False)
+    most = max((int(head.seen.sum()) for head in heads), default=0) + 1
+    first = _searched(heads, table, columns, kinds, n_actions, evidence_tables(most), False)
     certain = min(best_prior(first).certain, SUREST)
-    return _searched(heads, table, columns, kinds, n_actions, evidence_tables(len(table) + 1, certain), in_pairs)
+    return _searched(heads, table, columns, kinds, n_actions, evidence_tables(most, certain), in_pairs)
 
 
 def _searched(
@@ -70,7 +71,7 @@ def _next_splits(
         if search.open:
             more = ((counts > counts[h]).sum() + 0.5) / ((counts >= counts[h]).sum() + 1.0)
             odds = math.log(more / (1.0 - more)) if learned else -FIRST
-            chosen = best_split(search.head, columns, np.minimum(prior + odds, -LEAST), narrow, tables)
+            chosen = best_split(search.head, search.tally(columns), np.minimum(prior + odds, -LEAST), narrow, tables)
             if chosen.gain > 0.0:
                 found.append((h, chosen))
     found.sort(key=lambda entry: -entry[1].gain)

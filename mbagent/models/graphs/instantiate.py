@@ -9,9 +9,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.graphs.compiled import Graphs, linked
+from mbagent.models.graphs.compiled import Graphs, linked, n_columns
 from mbagent.models.graphs.units import Layout, coupled_layout, lay_out
-from mbagent.models.graphs.windows import ACTION, BORDER, CELL, MEETING
+from mbagent.models.graphs.windows import ACTION, BORDER, MEETING, NEXT
 from mbagent.spaces import PlaneLayout
 
 Ints: TypeAlias = NDArray[np.int64]
@@ -48,6 +48,7 @@ class LocalGraphs:
 
     Attributes:
         graphs: units are the channels, then ``terminated`` and the event; columns are relative.
+        late: those of channels whose cells are drawn late, from the upper left on, channel after channel.
         columns: the relative columns, int64 [D, 7], see ``windows.py``.
         cardinalities: number of values of each channel's cells, length C.
         n_actions: number of actions A.
@@ -55,28 +56,33 @@ class LocalGraphs:
     """
 
     graphs: Graphs
+    late: Graphs
     columns: Ints
     cardinalities: tuple[int, ...]
     n_actions: int
     couplings: tuple[Coupling, ...]
 
 
-def instantiate(local: LocalGraphs, board: PlaneLayout) -> tuple[Layout, Graphs]:
-    """Units and graphs for a board."""
+def instantiate(local: LocalGraphs, board: PlaneLayout) -> tuple[Layout, Graphs, Graphs]:
+    """Units, graphs and late graphs for a board."""
     n_factors = board.channels * board.height * board.width
     cells = board.to_planes(np.arange(n_factors)[None])[0]
     cardinalities = np.empty(n_factors, dtype=np.int64)
     for channel, values in enumerate(local.cardinalities):
         cardinalities[cells[channel]] = values
-    used = np.unique(local.graphs.column[local.graphs.column >= 0])
+    asked = np.concatenate([local.graphs.column, local.late.column])
+    used = np.unique(asked[asked >= 0])
     meetings = used[local.columns[used, 0] == MEETING]
     layout = lay_out([int(c) for c in cardinalities], (), local.n_actions)
     layout = layout._replace(cells=cells, meetings=np.ascontiguousarray(local.columns[meetings, 1:]))
-    layout = _couple(layout, local.couplings)
-    return layout, _Board(local, layout, meetings).graphs()
+    layout = with_couplings(layout, local.couplings)
+    late = _Board(local, layout, meetings).graphs(local.late)
+    cells = np.concatenate([*(layout.cells[c].ravel() for c in local.late.changing), np.zeros(0, dtype=np.int64)])
+    late = late._replace(changing=cells[layout.coupling_of[cells] < 0])
+    return layout, _Board(local, layout, meetings).graphs(local.graphs), late
 
 
-def _couple(layout: Layout, couplings: Sequence[Coupling]) -> Layout:
+def with_couplings(layout: Layout, couplings: Sequence[Coupling]) -> Layout:
     """The layout with its couplings; a cell is in the first that claims it."""
     of, exactly = layout.coupling_of.copy(), []
     groups: list[Ints] = []
@@ -94,15 +100,16 @@ class _Board:
     """Graphs of all cells while they are built. A cell's unit has the number of its factor."""
 
     def __init__(self, local: LocalGraphs, layout: Layout, meetings: Ints) -> None:
-        self.local, self.layout = local, layout
+        self.local, self.layout, self.relative = local, layout, local.graphs
         self.links: list[tuple[int, int, int]] = []
         self.leaves: list[int] = []
+        self.columns: list[list[int]] = local.columns.tolist()
         self.first_column = np.searchsorted(layout.factor, np.arange(layout.n_factors))
         self.meeting = {int(d): len(layout.factor) + layout.n_actions + i for i, d in enumerate(meetings)}
 
-    def graphs(self) -> Graphs:
-        """All of them."""
-        local, layout, graphs = self.local, self.layout, self.local.graphs
+    def graphs(self, graphs: Graphs) -> Graphs:
+        """All of them, from those of relative columns."""
+        local, layout, self.relative = self.local, self.layout, graphs
         _, height, width = layout.cells.shape
         pairs = np.concatenate([[0], np.cumsum(layout.n_actions * layout.outputs)]).astype(np.int64)
         shared = {int(node): self._add(-1, 0, 0, int(node)) for node in np.flatnonzero(graphs.column < 0)}
@@ -143,7 +150,7 @@ class _Board:
 
     def _nodes_of(self, channel: int) -> list[int]:
         """Inner nodes of a channel's graphs, children first."""
-        graphs = self.local.graphs
+        graphs = self.relative
         begin, end = graphs.entries[graphs.pairs[channel]], graphs.entries[graphs.pairs[channel + 1]]
         found: set[int] = set()
         stack = [int(node) for node in graphs.nodes[begin:end]]
@@ -156,7 +163,7 @@ class _Board:
 
     def _copy(self, nodes: Sequence[int], shared: dict[int, int], y: int, x: int) -> dict[int, int]:
         """Nodes for a position; what the border decides there is decided."""
-        graphs, copies = self.local.graphs, dict(shared)
+        graphs, copies = self.relative, dict(shared)
         for node in nodes:
             off, on = copies[int(graphs.off[node])], copies[int(graphs.on[node])]
             column = self._absolute(int(graphs.column[node]), y, x)
@@ -166,23 +173,24 @@ class _Board:
     def _absolute(self, relative: int, y: int, x: int) -> int:
         """Column of the board that a relative column is at a position."""
         _, height, width = self.layout.cells.shape
-        kind, *parts = (int(part) for part in self.local.columns[relative])
+        kind, *parts = self.columns[relative]
         if kind == ACTION:
             return len(self.layout.factor) + parts[0]
         if kind == MEETING:
             return self.meeting[relative]
-        row, column = (y + parts[2], x + parts[3]) if kind == CELL else (y + parts[0], x + parts[1])
+        row, column = (y + parts[0], x + parts[1]) if kind == BORDER else (y + parts[2], x + parts[3])
         inside = 0 <= row < height and 0 <= column < width
         if kind == BORDER:
             return _NEVER if inside else _ALWAYS
         if not inside:
             return _NEVER
         value = parts[1] if self.local.cardinalities[parts[0]] != 2 else 0
-        return int(self.first_column[self.layout.cells[parts[0], row, column]]) + value
+        begin = n_columns(self.layout) if kind == NEXT else 0
+        return int(begin + self.first_column[self.layout.cells[parts[0], row, column]]) + value
 
     def _entries(self, channel: int, begin: int, copies: dict[int, int]) -> list[tuple[int, int, int]]:
         """Entries (pair, value, node) of a unit whose pairs begin at ``begin``."""
-        graphs = self.local.graphs
+        graphs = self.relative
         first, last = graphs.pairs[channel], graphs.pairs[channel + 1]
         return [
             (begin + int(pair - first), int(graphs.values[entry]), copies[int(graphs.nodes[entry])])

@@ -72,10 +72,7 @@ class DecisionGraphModel(BaseTransitionModel):
             progress(0.4)
         flagged = flag_events(train.states, train.next_states) & events.any()
         self.fitted = fit_graphs(self.cardinalities, self.n_actions, train, flagged)
-        likelihood, jointly = self._likelihood(self.fitted, held_out), False
-        if len(self.fitted.late.changing):
-            apart = self._likelihood(replace(self.fitted, late=nothing_late(self.fitted.usual)), held_out)
-            likelihood, jointly = max(likelihood, apart), likelihood > apart
+        likelihood, jointly = self._jointly(held_out)
         if progress is not None:
             progress(0.7)
         exact = self._exact_match(held_out)
@@ -84,6 +81,14 @@ class DecisionGraphModel(BaseTransitionModel):
             progress(1.0)
         figures = {"nodes": float(len(self.fitted.usual.column)), "events": float(events.sum())}
         return self._report(began, (len(rows), len(held_out)), likelihood, exact, figures)
+
+    def _jointly(self, held_out: TransitionBatch) -> tuple[float, bool]:
+        """Held-out likelihood, and whether it is better for drawing some units late."""
+        likelihood = self._likelihood(self.fitted, held_out)
+        if len(self.fitted.late.changing) == 0:
+            return likelihood, False
+        apart = self._likelihood(replace(self.fitted, late=nothing_late(self.fitted.usual)), held_out)
+        return max(likelihood, apart), likelihood > apart
 
     def _report(
         self, began: float, sizes: tuple[int, int], likelihood: float, exact: float, figures: Mapping[str, float]

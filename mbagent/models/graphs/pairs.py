@@ -43,6 +43,10 @@ MOST_CONTEXTS = 4
 """Contexts of a head that pairs are looked for in, the most mixed ones."""
 
 
+EXACT = 2**24
+"""Sums up to here are exact in single precision."""
+
+
 class PairSearch:
     """Looks for pairs of columns where single ones explain nothing more.
 
@@ -123,16 +127,18 @@ def find_pairs(head: Head, contexts: Sequence[int], table: Bools, prior: Floats,
     found: list[Pair] = []
     for context in contexts:
         rows = head.context == context
-        if rows.sum() >= FEWEST:
-            found += _in_context(context, table[head.rows[rows]], head.came[rows], prior, patterns, tables)
+        if head.seen[rows].sum() >= FEWEST:
+            found += _in_context(context, table[head.rows[rows]], head.seen[rows], head.came[rows], prior, patterns, tables)
     best = max(found, default=None)
     return [] if best is None else [pair for pair in found if pair.context == best.context]
 
 
-def _in_context(context: int, table: Bools, came: Ints, prior: Floats, patterns: Floats, tables: Tables) -> list[Pair]:
+def _in_context(
+    context: int, table: Bools, seen: Ints, came: Ints, prior: Floats, patterns: Floats, tables: Tables
+) -> list[Pair]:
     on = table.astype(np.float32)
-    cells_n, cells_e = _cells(on, np.ones_like(came)), _cells(on, came)
-    n, e = len(came), int(came.sum())
+    cells_n, cells_e = _cells(on, seen), _cells(on, came)
+    n, e = int(seen.sum()), int(came.sum())
     best, which = np.full(prior.shape, -np.inf), np.zeros(prior.shape, dtype=np.int64)
     for number, pattern in enumerate(PATTERNS):
         inside_n, inside_e = _inside(cells_n, pattern), _inside(cells_e, pattern)
@@ -154,7 +160,8 @@ def _in_context(context: int, table: Bools, came: Ints, prior: Floats, patterns:
 
 def _cells(on: NDArray[np.float32], weights: Ints) -> tuple[Ints, Ints, Ints, Ints]:
     """Weight of the rows in which neither, the second only, the first only, both of two columns are on, int64 [D, D] each."""
-    both = np.rint((on * weights[:, None].astype(np.float32)).T @ on).astype(np.int64)
+    exact = np.float32 if weights.sum() < EXACT else np.float64
+    both = np.rint((on * weights[:, None]).astype(exact).T @ on.astype(exact)).astype(np.int64)
     single = np.diag(both)
     first, second = single[:, None] - both, single[None, :] - both
     return int(weights.sum()) - both - first - second, second, first, both

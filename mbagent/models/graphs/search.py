@@ -8,7 +8,21 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.graphs.evidence import ACTION, ALL, SINGLE, VALUE, Chosen, Floats, Head, Ints, Tables, evidences
+from mbagent.models.graphs.evidence import (
+    ACTION,
+    ALL,
+    SINGLE,
+    VALUE,
+    Chosen,
+    Columns,
+    Floats,
+    Head,
+    Ints,
+    Tables,
+    Tally,
+    count,
+    evidences,
+)
 
 Bools: TypeAlias = NDArray[np.bool_]
 
@@ -62,18 +76,27 @@ class Search:
     typical: Floats = field(init=False)
     splits: list[Split] = field(default_factory=list)
     open: bool = field(init=False)
+    _tally: Tally | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         """Starts with the rate of all rows."""
-        came = self.head.came
-        self.open = bool(len(came)) and 0 < came.sum() < len(came)
-        self.typical = np.full(len(self.head.action), came.mean() if len(came) else 0.5)
+        came, seen = int(self.head.came.sum()), int(self.head.seen.sum())
+        self.open = 0 < came < seen
+        self.typical = np.full(len(self.head.action), came / seen if seen else 0.5)
 
     def counts(self, rows: Bools | None = None) -> tuple[Ints, Ints]:
-        """Rows and arrivals of each context, int64 [C] each; of some rows only where ``rows`` [R] is given."""
+        """Rows met and arrivals of each context, int64 [C] each; of some rows only where ``rows`` [R] is given."""
         head, size = self.head, len(self.head.action)
-        context, came = (head.context, head.came) if rows is None else (head.context[rows], head.came[rows])
-        return np.bincount(context, minlength=size), np.bincount(context, weights=came, minlength=size).astype(np.int64)
+        some = slice(None) if rows is None else rows
+        context, seen, came = head.context[some], head.seen[some], head.came[some]
+        n, e = (np.bincount(context, weights=w, minlength=size).astype(np.int64) for w in (seen, came))
+        return n, e
+
+    def tally(self, columns: Columns) -> Tally:
+        """Counts of each context with each column on, made once."""
+        if self._tally is None:
+            self._tally = count(self.head, columns)
+        return self._tally
 
     def merge(self, tables: Tables) -> None:
         """Lets all contexts share one rate where that has more evidence, as a split by no column would."""
@@ -103,7 +126,8 @@ class Search:
         rows = head.context == pair.context
         cell = 2 * table[head.rows, pair.first] + table[head.rows, pair.second]
         inside = np.asarray(pair.pattern)[cell]
-        rates = [head.came[rows & side].mean() if (rows & side).any() else 0.5 for side in (~inside, inside)]
+        sides = [rows & side for side in (~inside, inside)]
+        rates = [head.came[side].sum() / head.seen[side].sum() if side.any() else 0.5 for side in sides]
         same, apart = np.arange(size), np.where(np.arange(size) == pair.context, size, np.arange(size))
         typical = np.append(self.typical, self.typical[pair.context])
         self._take(Split(pair.first, same, apart, pair.gain), table[head.rows, pair.first], typical)
@@ -131,8 +155,9 @@ class Search:
                 np.minimum.at(low, target, old)
                 np.maximum.at(high, target, old)
             labels.append(np.where(low == high, low, -1))
-        self.head = Head(head.rows, head.came, context, labels[0], labels[1])
+        self.head = head._replace(context=context, action=labels[0], value=labels[1])
         self.typical = typical[:size]
+        self._tally = None
         self.splits.append(split)
 
     def _covered(self, chosen: Chosen) -> Bools:

@@ -13,6 +13,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent.models.base import hash_rows
 from mbagent.models.graphs.evidence import Head
 
 Ints: TypeAlias = NDArray[np.int64]
@@ -163,32 +164,60 @@ class Question:
     head: Head
 
 
-def ask(unit: int, cardinality: int, actions: Ints, now: Ints, then: Ints, rows: Ints) -> list[Question]:
+@dataclass(frozen=True)
+class Seen:
+    """Rows and what they look like.
+
+    Attributes:
+        pattern: number of each row's look, action included, int64 [N]; rows of one look have one present value.
+        actions: int64 [N].
+        now: a unit's present values, int64 [N].
+        then: those that follow, int64 [N].
+    """
+
+    pattern: Ints
+    actions: Ints
+    now: Ints
+    then: Ints
+
+    def select(self, rows: Ints) -> Seen:
+        """Some of the rows."""
+        return Seen(self.pattern[rows], self.actions[rows], self.now[rows], self.then[rows])
+
+
+def ask(unit: int, cardinality: int, seen: Seen) -> list[Question]:
     """The questions about one unit; none if it never changes.
 
     Args:
         unit: its number.
         cardinality: number of its values.
-        actions: int64 [N].
-        now: its values, int64 [N].
-        then: those that follow, int64 [N].
-        rows: which rows to ask, int64 [R].
+        seen: the rows to ask.
     """
-    pair = actions * cardinality + now
-    if (now[rows] == then[rows]).all():
+    if (seen.now == seen.then).all():
         return []
+    pair = seen.actions * cardinality + seen.now
     if cardinality == 2:
-        return [_question(unit, 1, cardinality, pair, then, rows)]
+        return [_question(unit, 1, cardinality, pair, seen)]
     asked = []
-    for value in np.unique(then[rows][now[rows] != then[rows]]):
-        leading = np.unique(pair[rows][then[rows] == value])
+    for value in np.unique(seen.then[seen.now != seen.then]):
+        leading = np.unique(pair[seen.then == value])
         leading = leading[leading % cardinality != value]
-        asked.append(_question(unit, int(value), cardinality, pair, then, rows[np.isin(pair[rows], leading)]))
+        rows = np.flatnonzero(np.isin(pair, leading))
+        asked.append(_question(unit, int(value), cardinality, pair[rows], seen.select(rows)))
     return asked
 
 
-def _question(unit: int, value: int, cardinality: int, pair: Ints, then: Ints, rows: Ints) -> Question:
-    pairs, context = np.unique(pair[rows], return_inverse=True)
-    came = (then[rows] == value).astype(np.int64)
-    head = Head(rows, came, context.astype(np.int64), pairs // cardinality, pairs % cardinality)
+def _question(unit: int, value: int, cardinality: int, pair: Ints, seen: Seen) -> Question:
+    n, came = np.bincount(seen.pattern), np.bincount(seen.pattern, weights=seen.then == value).astype(np.int64)
+    pair_of = np.empty(len(n), dtype=np.int64)
+    pair_of[seen.pattern] = pair
+    rows = np.flatnonzero(n)
+    pairs, context = np.unique(pair_of[rows], return_inverse=True)
+    head = Head(rows, n[rows], came[rows], context.astype(np.int64), pairs // cardinality, pairs % cardinality)
     return Question(unit, value, pairs, head)
+
+
+def distinct(table: NDArray[np.generic]) -> tuple[Ints, Ints]:
+    """Numbers of rows that look different [P], and which of them each row [N] looks like, int64 [N]."""
+    _, first, pattern = np.unique(hash_rows(table), return_index=True, return_inverse=True)
+    return first, pattern.astype(np.int64)

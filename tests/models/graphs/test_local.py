@@ -11,7 +11,7 @@ from gymnasium import spaces
 from mbagent import ModelLearningAgent
 from mbagent.models.graphs import DecisionGraphModel, LocalGraphModel
 from mbagent.models.graphs.instantiate import COLUMN, WHOLE, Coupling
-from mbagent.models.graphs.windows import ACTION, BORDER, CELL, column_kinds, column_values, relative_columns
+from mbagent.models.graphs.windows import ACTION, BORDER, CELL, NEXT, column_kinds, column_values, relative_columns
 from mbagent.spaces import FactoredSpace
 from mbagent.transitions import TransitionDataset
 from mbagent_envs import FlierCatcher, Maneuverer
@@ -27,15 +27,18 @@ def test_columns_are_what_lies_around_each_position() -> None:
     rng = np.random.default_rng(0)
     board, actions = rng.integers(2, size=(4, 2, 3, 5)), rng.integers(3, size=4)
     columns = relative_columns((2, 2), 3, 1)
-    table = column_values(columns, board, actions).reshape(4, 3, 5, len(columns))
+    after = rng.integers(2, size=board.shape)
+    table = column_values(columns, board, actions, after).reshape(4, 3, 5, len(columns))
 
-    def cell(n: int, channel: int, y: int, x: int) -> bool:
-        return 0 <= y < 3 and 0 <= x < 5 and bool(board[n, channel, y, x] == 1)
+    def cell(n: int, channel: int, y: int, x: int, planes: np.ndarray = board) -> bool:
+        return 0 <= y < 3 and 0 <= x < 5 and bool(planes[n, channel, y, x] == 1)
 
     for d, (kind, *parts) in enumerate(columns.tolist()):
         for n, y, x in np.ndindex(4, 3, 5):
             if kind == CELL:
                 expected = cell(n, parts[0], y + parts[2], x + parts[3])
+            elif kind == NEXT:
+                expected = cell(n, parts[0], y + parts[2], x + parts[3], after)
             elif kind == BORDER:
                 expected = not (0 <= y + parts[0] < 3 and 0 <= x + parts[1] < 5)
             elif kind == ACTION:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import special
 
-from mbagent.models.graphs.evidence import ALL, SINGLE, Head, best_split, columns_of, evidence, evidence_tables
+from mbagent.models.graphs.evidence import ALL, SINGLE, Head, best_split, columns_of, count, evidence, evidence_tables
 from mbagent.models.graphs.exclusive import find_cliques, find_groups
 from mbagent.models.graphs.greedy import find_splits
 from mbagent.models.graphs.search import Search
@@ -16,7 +16,8 @@ def head(came: np.ndarray, context: np.ndarray | None = None) -> Head:
     """A head over all rows; contexts are actions with one value."""
     context = np.zeros(len(came), dtype=np.int64) if context is None else context
     n = int(context.max()) + 1
-    return Head(np.arange(len(came)), came.astype(np.int64), context, np.arange(n), np.zeros(n, dtype=np.int64))
+    once = np.ones(len(came), dtype=np.int64)
+    return Head(np.arange(len(came)), once, came.astype(np.int64), context, np.arange(n), np.zeros(n, dtype=np.int64))
 
 
 def rate_by_columns(search: Search, table: np.ndarray) -> np.ndarray:
@@ -39,7 +40,8 @@ def test_the_best_split_has_the_evidence_that_counting_by_hand_gives() -> None:
     context = RNG.integers(3, size=300)
     came = (table[:, 4] & (context != 1)) | (RNG.random(300) < 0.1)
     tables = evidence_tables(301)
-    chosen = best_split(head(came, context), columns_of(table), np.full(6, -2.0), np.array([-50.0, -50.0, -3.0]), tables)
+    asked = head(came, context)
+    chosen = best_split(asked, count(asked, columns_of(table)), np.full(6, -2.0), np.array([-50.0, -50.0, -3.0]), tables)
 
     def total(rows: np.ndarray) -> float:
         return float(evidence(int(came[rows].sum()), int(rows.sum()), *tables))

@@ -1,0 +1,222 @@
+"""Learning graphs for planes: one for each channel, from all positions at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.graphs import draws
+from mbagent.models.graphs.compiled import Graphs, build, habit_of
+from mbagent.models.graphs.conditioner import UNCERTAIN, go_together
+from mbagent.models.graphs.fitting import nothing_late
+from mbagent.models.graphs.greedy import find_splits
+from mbagent.models.graphs.instantiate import COLUMN, ROW, WHOLE, Coupling
+from mbagent.models.graphs.search import Search
+from mbagent.models.graphs.units import Layout, Question, Seen, ask, distinct, lay_out
+from mbagent.models.graphs.windows import ACTION, MEETING, NEXT, column_kinds, column_values, known_columns, shifted
+from mbagent.spaces import PlaneLayout
+from mbagent.transitions import TransitionBatch
+
+Ints: TypeAlias = NDArray[np.int64]
+Bools: TypeAlias = NDArray[np.bool_]
+Floats: TypeAlias = NDArray[np.float64]
+
+MOST_CELLS = 200_000_000
+"""Entries of the table of columns that the search reads; of more transitions than that, evenly chosen ones are searched."""
+
+TOGETHER = 12.0
+"""Two bits of a set must have been expected together this often before "never" is believed of them."""
+
+SOME_CELLS = 100_000
+"""Cells that are looked at for errors that go together."""
+
+
+def channel_layout(cardinalities: Sequence[int], n_actions: int) -> Layout:
+    """Channels as the factors of a layout; its own columns mean nothing."""
+    return lay_out(cardinalities, (), n_actions)
+
+
+class PlaneTable:
+    """Transitions of planes, as cells with their relative columns.
+
+    Attributes:
+        table: columns of the neighbourhood of all cells that look different, bool [looks, near].
+
+    Args:
+        rows: N transitions.
+        board: where cells lie.
+        cardinalities: number of values of each channel's cells, length C.
+        columns: all relative columns, int64 [D, 7].
+        n_actions: number of actions A.
+    """
+
+    def __init__(
+        self, rows: TransitionBatch, board: PlaneLayout, cardinalities: tuple[int, ...], columns: Ints, n_actions: int
+    ) -> None:
+        """See the class."""
+        self.board, self.cardinalities, self.columns, self.n_actions = board, cardinalities, columns, n_actions
+        self.n_cells = board.height * board.width
+        known = known_columns(columns, board.to_planes(rows.states)) if len(rows) else np.zeros(0, dtype=np.int64)
+        kind = columns[known, 0]
+        self.near = known[(kind != NEXT) & ((kind != MEETING) | (columns[known, 5:] == 0).all(axis=1))]
+        self.far = known[(kind == MEETING) | (kind == ACTION)]
+        most = max(1, MOST_CELLS // (self.n_cells * max(len(self.near), 1)))
+        self.rows = rows.select(np.linspace(0, len(rows) - 1, most).astype(np.int64)) if len(rows) > most else rows
+        self.before, self.after = board.to_planes(self.rows.states), board.to_planes(self.rows.next_states)
+        self.actions = np.repeat(self.rows.actions, self.n_cells)
+        table = column_values(self.columns[self.near], self.before, self.rows.actions)
+        first, self.pattern = distinct(np.packbits(table, axis=1))
+        self.table = table[first]
+
+    def seen(self, channel: int) -> Seen:
+        """A channel's values in all cells; looks are rows of ``table``."""
+        return Seen(self.pattern, self.actions, self.before[:, channel].reshape(-1), self.after[:, channel].reshape(-1))
+
+    def far_values(self) -> Bools:
+        """Columns that are the same at all positions, bool [N, far]."""
+        each = [column_values(self.columns[d : d + 1], self.before, self.rows.actions)[:: self.n_cells, 0] for d in self.far]
+        return np.stack(each, axis=1)
+
+    def split(self, asked: Sequence[Question], table: Bools, numbers: Ints) -> list[Search]:
+        """Splits by columns of a table, which have these numbers among the relative ones."""
+        found = find_splits([q.head for q in asked], table, column_kinds(self.columns)[numbers], self.n_actions)
+        return [search.renamed(numbers) for search in found]
+
+    def build(self, asked: Sequence[Question], found: Sequence[Search]) -> Graphs:
+        """Graphs of channels, ``terminated`` and the event that never happens."""
+        habits = [
+            habit_of(k, self.n_actions, self.actions, self.before[:, c].reshape(-1), self.after[:, c].reshape(-1))
+            for c, k in enumerate(self.cardinalities)
+        ]
+        nothing, ends = np.zeros(len(self.rows), dtype=np.int64), self.rows.terminated.astype(np.int64)
+        habits += [habit_of(2, self.n_actions, self.rows.actions, nothing, then) for then in (ends, nothing)]
+        still = 0.5 / (len(self.actions) * len(self.cardinalities) + 1.0)
+        return build(channel_layout(self.cardinalities, self.n_actions), asked, found, habits, still)
+
+
+def learn_channels(planes: PlaneTable) -> tuple[Graphs, list[Question], list[Search]]:
+    """Graphs of all channels, each cell for itself, and of ``terminated``."""
+    asked: list[Question] = []
+    for channel, cardinality in enumerate(planes.cardinalities):
+        asked += ask(channel, cardinality, planes.seen(channel))
+    found = planes.split(asked, planes.table, planes.near) if asked else []
+    rows = planes.rows
+    if rows.terminated.any():
+        far = planes.far_values()
+        first, pattern = distinct(np.packbits(far, axis=1))
+        nothing, ends = np.zeros(len(rows), dtype=np.int64), rows.terminated.astype(np.int64)
+        over = ask(len(planes.cardinalities), 2, Seen(pattern, rows.actions, nothing, ends))
+        asked, found = asked + over, found + planes.split(over, far[first], planes.far)
+    return planes.build(asked, found), asked, found
+
+
+def learn_late(planes: PlaneTable, layout: Layout, graphs: Graphs) -> tuple[Graphs, list[Question], list[Search]]:
+    """Graphs of the channels whose cells hang on what others become, given those.
+
+    Args:
+        planes: the transitions.
+        layout: of the board.
+        graphs: of all cells, each for itself.
+    """
+    late, asked, found = [], [], []
+    for channel, numbers in _dependent(planes, layout, graphs).items():
+        units = layout.cells[channel].ravel()
+        needed = draws.uncertain(planes.rows.states, planes.rows.actions, layout, graphs, units)
+        which = np.flatnonzero((needed & (layout.coupling_of[units] < 0)).ravel())
+        some = planes.seen(channel).select(which)
+        following = column_values(planes.columns[numbers], planes.before, planes.rows.actions, planes.after)[which]
+        first, pattern = distinct(np.concatenate([some.pattern[:, None], following], axis=1))
+        questions = ask(channel, planes.cardinalities[channel], replace(some, pattern=pattern))
+        table = np.concatenate([planes.table[some.pattern[first]], following[first]], axis=1)
+        searches = planes.split(questions, table, np.concatenate([planes.near, numbers])) if questions else []
+        if any(split.column in numbers for search in searches for split in search.splits):
+            late.append(channel)
+            asked += questions
+            found += searches
+    if not late:
+        return nothing_late(graphs), [], []
+    return planes.build(asked, found)._replace(changing=np.asarray(late, dtype=np.int64)), asked, found
+
+
+def _dependent(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[int, Ints]:
+    """For each channel, numbers of the columns of the kind NEXT whose errors go with those of its cells."""
+    errors = _errors(planes, layout, graphs)
+    found: dict[int, Ints] = {}
+    for channel in sorted({c for c, _ in errors}):
+        own = [errors[key] for key in errors if key[0] == channel]
+        earlier = [d for d in np.flatnonzero(planes.columns[:, 0] == NEXT) if _is_earlier(planes.columns[d], channel)]
+        kept = []
+        for d in earlier:
+            _, other, value, below, right, _, _ = (int(part) for part in planes.columns[d])
+            if (other, value) in errors:
+                error, spread = (shifted(part, below, right) for part in errors[other, value])
+                if any(go_together(e, error, v, spread, len(earlier)) for e, v in own):
+                    kept.append(int(d))
+        if kept:
+            found[channel] = np.asarray(kept, dtype=np.int64)
+    return found
+
+
+def _is_earlier(column: Ints, channel: int) -> bool:
+    """Whether a cell of the next state is drawn before those of the channel at the same place."""
+    return bool(column[1] < channel or (column[1] == channel and tuple(column[3:5]) < (0, 0)))
+
+
+def _errors(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[tuple[int, int], tuple[Floats, Floats]]:
+    """Errors and their variances, [n, H, W] each, of every (channel, value) that is uncertain, in some rows."""
+    if len(planes.rows) == 0:
+        return {}
+    n = min(max(100, SOME_CELLS // planes.n_cells), len(planes.rows))
+    some = np.linspace(0, len(planes.rows) - 1, n).astype(np.int64)
+    rows, cards = planes.rows.select(some), np.empty(layout.n_factors, dtype=np.int64)
+    for channel, k in enumerate(planes.cardinalities):
+        cards[layout.cells[channel]] = k
+    start = np.concatenate([[0], np.cumsum(cards)]).astype(np.int64)
+    probs = np.empty((n, int(start[-1])))
+    draws.marginals(rows.states, rows.actions, layout, graphs, start, probs)
+    found = {}
+    for channel, k in enumerate(planes.cardinalities):
+        alone = layout.coupling_of[layout.cells[channel]] < 0
+        for value in range(k) if k > 2 else (1,):
+            p = probs[:, start[layout.cells[channel]] + value]
+            spread = p * (1.0 - p) * alone
+            if spread.sum() > UNCERTAIN:
+                found[channel, value] = ((planes.after[some, channel] == value) - p) * alone, spread
+    return found
+
+
+def find_couplings(
+    rows: TransitionBatch, board: PlaneLayout, cardinalities: tuple[int, ...], some: TransitionBatch, ones: Floats
+) -> tuple[Coupling, ...]:
+    """Sets of cells that are coupled: whole channels of which one cell is on, or lines of which two are never on.
+
+    Args:
+        rows: all transitions.
+        board: where cells lie.
+        cardinalities: number of values of each channel's cells.
+        some: a few of the transitions.
+        ones: each cell's probability to be on after those, [n, C, H, W].
+    """
+    if len(rows) == 0:
+        return ()
+    before, after = board.to_planes(rows.states), board.to_planes(rows.next_states)
+    found: list[tuple[float, Coupling]] = []
+    for channel in (c for c, k in enumerate(cardinalities) if k == 2):
+        count = after[:, channel].sum(axis=(1, 2))
+        if len(count) and (count == 1).all() and (before[:, channel].sum(axis=(1, 2)) == 1).all():
+            found.append((np.inf, Coupling(channel, WHOLE, 0, True)))
+            continue
+        for kind, axis, length in ((WHOLE, (1, 2), 1), (ROW, (2,), board.height), (COLUMN, (1,), board.width)):
+            p = ones[:, channel]
+            total, squares = p.sum(axis=axis).reshape(len(p), -1), (p**2).sum(axis=axis).reshape(len(p), -1)
+            expected = (total**2 - squares).sum(axis=0) / 2.0 * (len(rows) / max(len(some), 1))
+            alone = after[:, channel].sum(axis=axis).reshape(len(rows), -1).max(axis=0, initial=0) <= 1
+            for i in np.flatnonzero(alone & (expected > TOGETHER)):
+                line = int(i) if i < (length + 1) // 2 else int(i) - length
+                found.append((float(expected[i]), Coupling(channel, kind, line, False)))
+    found.sort(key=lambda entry: -entry[0])
+    return tuple(coupling for _, coupling in found)
