@@ -17,7 +17,20 @@ from mbagent.models.graphs.greedy import find_splits
 from mbagent.models.graphs.instantiate import COLUMN, ROW, WHOLE, Coupling
 from mbagent.models.graphs.search import Search
 from mbagent.models.graphs.units import Layout, Question, Seen, ask, distinct, lay_out
-from mbagent.models.graphs.windows import ACTION, MEETING, NEXT, column_kinds, column_values, known_columns, shifted
+from mbagent.models.graphs.windows import (
+    ACTION,
+    BORDER,
+    CELL,
+    MEETING,
+    NEXT,
+    NEXT_MEETING,
+    WRAP,
+    column_kinds,
+    column_values,
+    far_value,
+    known_columns,
+    shifted,
+)
 from mbagent.spaces import PlaneLayout
 from mbagent.transitions import TransitionBatch
 
@@ -26,7 +39,10 @@ Bools: TypeAlias = NDArray[np.bool_]
 Floats: TypeAlias = NDArray[np.float64]
 
 MOST_CELLS = 200_000_000
-"""Entries of the table of columns that the search reads; of more transitions than that, evenly chosen ones are searched."""
+"""Entries of the table of columns that the search reads; of more transitions than that, the first are searched."""
+
+CHUNK = 50_000_000
+"""Entries of the table that are made at once."""
 
 TOGETHER = 12.0
 """Two bits of a set must have been expected together this often before "never" is believed of them."""
@@ -60,26 +76,45 @@ class PlaneTable:
         """See the class."""
         self.board, self.cardinalities, self.columns, self.n_actions = board, cardinalities, columns, n_actions
         self.n_cells = board.height * board.width
-        known = known_columns(columns, board.to_planes(rows.states)) if len(rows) else np.zeros(0, dtype=np.int64)
+        every = board.to_planes(rows.states), board.to_planes(rows.next_states)
+        known = known_columns(columns, *every)
         kind = columns[known, 0]
-        self.near = known[(kind != NEXT) & ((kind != MEETING) | (columns[known, 5:] == 0).all(axis=1))]
-        self.far = known[(kind == MEETING) | (kind == ACTION)]
-        most = max(1, MOST_CELLS // (self.n_cells * max(len(self.near), 1)))
-        self.rows = rows.select(np.linspace(0, len(rows) - 1, most).astype(np.int64)) if len(rows) > most else rows
-        self.before, self.after = board.to_planes(self.rows.states), board.to_planes(self.rows.next_states)
+        here = np.isin(kind, (CELL, BORDER, ACTION, WRAP)) | ((kind == MEETING) & (columns[known, 5:] == 0).all(axis=1))
+        self.near, self.far, self.next_far = (
+            known[which] for which in (here, np.isin(kind, (MEETING, ACTION)), kind == NEXT_MEETING)
+        )
+        self.table, self.pattern, n_rows = self._looks(every[0], rows.actions)
+        self.rows, self.before, self.after = rows.select(np.arange(n_rows)), every[0][:n_rows], every[1][:n_rows]
         self.actions = np.repeat(self.rows.actions, self.n_cells)
-        table = column_values(self.columns[self.near], self.before, self.rows.actions)
-        first, self.pattern = distinct(np.packbits(table, axis=1))
-        self.table = table[first]
+
+    def _looks(self, planes: Ints, actions: Ints) -> tuple[Bools, Ints, int]:
+        """Columns of all cells that look different, which each cell looks like, and how many transitions that is of.
+
+        Transitions are taken as long as there is room.
+        """
+        most, step = MOST_CELLS // max(len(self.near), 1), max(1, CHUNK // (self.n_cells * max(len(self.near), 1)))
+        looks, pattern, n_rows = np.zeros((0, -(-len(self.near) // 8)), dtype=np.uint8), [np.zeros(0, dtype=np.int64)], 0
+        while n_rows < len(planes) and len(looks) < most:
+            part = slice(n_rows, n_rows + step)
+            packed = np.packbits(column_values(self.columns[self.near], planes[part], actions[part]), axis=1)
+            first, of = distinct(packed)
+            both, known = np.concatenate([looks, packed[first]]), len(looks)
+            kept, now = distinct(both)
+            renamed = np.argsort(np.argsort(kept, kind="stable"), kind="stable")[now]  # looks known before keep their numbers
+            looks = both[np.sort(kept)]
+            pattern.append(renamed[known:][of])
+            n_rows += len(planes[part])
+        table = np.unpackbits(looks, axis=1, count=len(self.near)).astype(np.bool_)
+        return table, np.concatenate(pattern), min(n_rows, len(planes))
 
     def seen(self, channel: int) -> Seen:
         """A channel's values in all cells; looks are rows of ``table``."""
         return Seen(self.pattern, self.actions, self.before[:, channel].reshape(-1), self.after[:, channel].reshape(-1))
 
-    def far_values(self) -> Bools:
-        """Columns that are the same at all positions, bool [N, far]."""
-        each = [column_values(self.columns[d : d + 1], self.before, self.rows.actions)[:: self.n_cells, 0] for d in self.far]
-        return np.stack(each, axis=1)
+    def far_values(self, numbers: Ints) -> Bools:
+        """Columns that are the same at all positions, bool [N, len(numbers)]."""
+        found = [far_value(self.columns[d], self.before, self.rows.actions, self.after) for d in numbers]
+        return np.stack(found, axis=1)
 
     def split(self, asked: Sequence[Question], table: Bools, numbers: Ints) -> list[Search]:
         """Splits by columns of a table, which have these numbers among the relative ones."""
@@ -104,18 +139,23 @@ def learn_channels(planes: PlaneTable) -> tuple[Graphs, list[Question], list[Sea
     for channel, cardinality in enumerate(planes.cardinalities):
         asked += ask(channel, cardinality, planes.seen(channel))
     found = planes.split(asked, planes.table, planes.near) if asked else []
-    rows = planes.rows
-    if rows.terminated.any():
-        far = planes.far_values()
-        first, pattern = distinct(np.packbits(far, axis=1))
-        nothing, ends = np.zeros(len(rows), dtype=np.int64), rows.terminated.astype(np.int64)
-        over = ask(len(planes.cardinalities), 2, Seen(pattern, rows.actions, nothing, ends))
-        asked, found = asked + over, found + planes.split(over, far[first], planes.far)
+    if planes.rows.terminated.any():
+        over, searches = _ends(planes, planes.far)
+        asked, found = asked + over, found + searches
     return planes.build(asked, found), asked, found
 
 
+def _ends(planes: PlaneTable, numbers: Ints) -> tuple[list[Question], list[Search]]:
+    """Whether episodes end, by columns that are the same at all positions."""
+    rows, far = planes.rows, planes.far_values(numbers)
+    first, pattern = distinct(np.packbits(far, axis=1))
+    nothing, ends = np.zeros(len(rows), dtype=np.int64), rows.terminated.astype(np.int64)
+    asked = ask(len(planes.cardinalities), 2, Seen(pattern, rows.actions, nothing, ends))
+    return asked, planes.split(asked, far[first], numbers)
+
+
 def learn_late(planes: PlaneTable, layout: Layout, graphs: Graphs) -> tuple[Graphs, list[Question], list[Search]]:
-    """Graphs of the channels whose cells hang on what others become, given those.
+    """Graphs of the channels whose cells hang on what others become, given those; and of ``terminated``.
 
     Args:
         planes: the transitions.
@@ -137,6 +177,11 @@ def learn_late(planes: PlaneTable, layout: Layout, graphs: Graphs) -> tuple[Grap
             late.append(channel)
             asked += questions
             found += searches
+    if planes.rows.terminated.any():
+        over, searches = _ends(planes, np.concatenate([planes.far, planes.next_far]))
+        if any(split.column in planes.next_far for search in searches for split in search.splits):
+            late.append(len(planes.cardinalities))
+            asked, found = asked + over, found + searches
     if not late:
         return nothing_late(graphs), [], []
     return planes.build(asked, found)._replace(changing=np.asarray(late, dtype=np.int64)), asked, found

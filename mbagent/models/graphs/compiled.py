@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mbagent.models.graphs.leaves import LeafPrior, best_prior
 from mbagent.models.graphs.search import Search
-from mbagent.models.graphs.units import Layout, Question
+from mbagent.models.graphs.units import BEYOND, Layout, Question
 from mbagent_envs._compiled import compiled
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -219,10 +219,16 @@ def show(state: Ints, action: int, layout: Layout, on: Bools) -> None:
 def _meets(state: Ints, cells: Ints, meeting: Ints) -> bool:
     _, height, width = cells.shape
     below, right = meeting[4], meeting[5]
-    for y in range(max(0, -below), min(height, height - below)):
-        for x in range(max(0, -right), min(width, width - right)):
-            if state[cells[meeting[0], y, x]] == meeting[1] and state[cells[meeting[2], y + below, x + right]] == meeting[3]:
-                return True
+    for y in range(height):
+        for x in range(width):
+            if state[cells[meeting[0], y, x]] == meeting[1]:
+                row, column = y + below, x + right
+                inside = 0 <= row < height and 0 <= column < width
+                if meeting[2] == BEYOND:
+                    if not inside:
+                        return True
+                elif inside and state[cells[meeting[2], row, column]] == meeting[3]:
+                    return True
     return False
 
 
@@ -238,6 +244,14 @@ def show_next(following: Ints, layout: Layout, on: Bools) -> None:
     n = n_columns(layout)
     for column in range(len(layout.factor)):
         on[n + column] = following[layout.factor[column]] == layout.value[column]
+
+
+@compiled
+def show_next_meetings(following: Ints, layout: Layout, on: Bools) -> None:
+    """Writes what meets what in a next state [F], after all other columns."""
+    n = n_columns(layout) + len(layout.factor)
+    for m in range(len(layout.next_meetings)):
+        on[n + m] = _meets(following, layout.cells, layout.next_meetings[m])
 
 
 @compiled

@@ -13,7 +13,19 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, distributions, n_columns, read, show, show_next, write
+from mbagent.models.graphs.compiled import (
+    Bools,
+    Floats,
+    Graphs,
+    Ints,
+    distributions,
+    n_columns,
+    read,
+    show,
+    show_next,
+    show_next_meetings,
+    write,
+)
 from mbagent.models.graphs.couplings import couple, settle, which, widest
 from mbagent.models.graphs.units import Layout
 from mbagent.models.particles import NEGLIGIBLE
@@ -27,7 +39,7 @@ class Work(NamedTuple):
     """Work space for one row at a time.
 
     Attributes:
-        on: which columns are on, bool [D + D'], those of the next state last.
+        on: which columns are on, bool [D + D' + M'], those of the next state last.
         values: of all units, int64 [U].
         rates: all units' distributions, [sum of cardinalities].
         still: which units have no graphs, bool [U].
@@ -51,7 +63,7 @@ def work_space(layout: Layout, graphs: Graphs, late: Graphs) -> Work:
     still, later = np.ones(len(layout.outputs), dtype=np.bool_), np.zeros(len(layout.outputs), dtype=np.bool_)
     still[graphs.changing], later[late.changing] = False, True
     return Work(
-        np.empty(n_columns(layout) + len(layout.factor), dtype=np.bool_),
+        np.empty(n_columns(layout) + len(layout.factor) + len(layout.next_meetings), dtype=np.bool_),
         np.zeros(len(layout.outputs), dtype=np.int64),
         np.empty(graphs.start[-1], dtype=np.float64),
         still,
@@ -131,6 +143,8 @@ def sample(
         for i in range(len(late.changing)):
             unit = late.changing[i]
             if is_late(unit, w.rates, layout, graphs):
+                if unit == n_units - 2:
+                    show_next_meetings(following[b], layout, w.on)
                 distributions(late.changing[i : i + 1], states[b], actions[b], layout, late, w.on, w.values, w.rates)
             u = -1.0 if greedy else uniform_at(keys[b], unit)
             _draw(unit, u, w, layout, late, following[b], terminated, b)
@@ -175,6 +189,7 @@ def log_prob(
         distributions(everything, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
         if len(late.changing):
             show_next(following[b], layout, w.on)
+            show_next_meetings(following[b], layout, w.on)
         for i in range(len(late.changing)):
             if is_late(late.changing[i], w.rates, layout, graphs):
                 distributions(late.changing[i : i + 1], states[b], actions[b], layout, late, w.on, w.values, w.rates)

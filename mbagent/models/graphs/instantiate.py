@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mbagent.models.graphs.compiled import Graphs, linked, n_columns
 from mbagent.models.graphs.units import Layout, coupled_layout, lay_out
-from mbagent.models.graphs.windows import ACTION, BORDER, MEETING, NEXT
+from mbagent.models.graphs.windows import ACTION, BORDER, MEETING, NEXT, NEXT_MEETING, WRAP
 from mbagent.spaces import PlaneLayout
 
 Ints: TypeAlias = NDArray[np.int64]
@@ -72,14 +72,16 @@ def instantiate(local: LocalGraphs, board: PlaneLayout) -> tuple[Layout, Graphs,
         cardinalities[cells[channel]] = values
     asked = np.concatenate([local.graphs.column, local.late.column])
     used = np.unique(asked[asked >= 0])
-    meetings = used[local.columns[used, 0] == MEETING]
+    meetings, later = (used[local.columns[used, 0] == kind] for kind in (MEETING, NEXT_MEETING))
     layout = lay_out([int(c) for c in cardinalities], (), local.n_actions)
-    layout = layout._replace(cells=cells, meetings=np.ascontiguousarray(local.columns[meetings, 1:]))
-    layout = with_couplings(layout, local.couplings)
-    late = _Board(local, layout, meetings).graphs(local.late)
-    cells = np.concatenate([*(layout.cells[c].ravel() for c in local.late.changing), np.zeros(0, dtype=np.int64)])
-    late = late._replace(changing=cells[layout.coupling_of[cells] < 0])
-    return layout, _Board(local, layout, meetings).graphs(local.graphs), late
+    now, then = (np.ascontiguousarray(local.columns[numbers, 1:]) for numbers in (meetings, later))
+    layout = with_couplings(layout._replace(cells=cells, meetings=now, next_meetings=then), local.couplings)
+    numbers = {int(d): len(layout.factor) + layout.n_actions + i for i, d in enumerate(meetings)}
+    numbers |= {int(d): n_columns(layout) + len(layout.factor) + i for i, d in enumerate(later)}
+    graphs, late = (_Board(local, layout, numbers).graphs(which) for which in (local.graphs, local.late))
+    units = [layout.cells[c].ravel() if c < len(cells) else np.asarray([n_factors]) for c in local.late.changing]
+    order = np.concatenate([*units, np.zeros(0, dtype=np.int64)])
+    return layout, graphs, late._replace(changing=order[layout.coupling_of[order] < 0])
 
 
 def with_couplings(layout: Layout, couplings: Sequence[Coupling]) -> Layout:
@@ -99,13 +101,13 @@ def with_couplings(layout: Layout, couplings: Sequence[Coupling]) -> Layout:
 class _Board:
     """Graphs of all cells while they are built. A cell's unit has the number of its factor."""
 
-    def __init__(self, local: LocalGraphs, layout: Layout, meetings: Ints) -> None:
+    def __init__(self, local: LocalGraphs, layout: Layout, meetings: dict[int, int]) -> None:
         self.local, self.layout, self.relative = local, layout, local.graphs
         self.links: list[tuple[int, int, int]] = []
         self.leaves: list[int] = []
         self.columns: list[list[int]] = local.columns.tolist()
         self.first_column = np.searchsorted(layout.factor, np.arange(layout.n_factors))
-        self.meeting = {int(d): len(layout.factor) + layout.n_actions + i for i, d in enumerate(meetings)}
+        self.meetings = meetings
 
     def graphs(self, graphs: Graphs) -> Graphs:
         """All of them, from those of relative columns."""
@@ -176,14 +178,15 @@ class _Board:
         kind, *parts = self.columns[relative]
         if kind == ACTION:
             return len(self.layout.factor) + parts[0]
-        if kind == MEETING:
-            return self.meeting[relative]
+        if kind in (MEETING, NEXT_MEETING):
+            return self.meetings[relative]
         row, column = (y + parts[0], x + parts[1]) if kind == BORDER else (y + parts[2], x + parts[3])
         inside = 0 <= row < height and 0 <= column < width
         if kind == BORDER:
             return _NEVER if inside else _ALWAYS
-        if not inside:
+        if inside == (kind == WRAP):
             return _NEVER
+        row, column = row % height, column % width
         value = parts[1] if self.local.cardinalities[parts[0]] != 2 else 0
         begin = n_columns(self.layout) if kind == NEXT else 0
         return int(begin + self.first_column[self.layout.cells[parts[0], row, column]]) + value

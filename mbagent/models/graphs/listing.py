@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mbagent.models.graphs.compiled import Graphs, Ints, distributions, show, show_next, write
+from mbagent.models.graphs.compiled import Graphs, Ints, distributions, show, show_next, show_next_meetings, write
 from mbagent.models.graphs.couplings import couple, settle
 from mbagent.models.graphs.draws import Work, alone, is_late, settled, work_space
 from mbagent.models.graphs.units import Layout
@@ -93,6 +93,8 @@ def _split_late(
         for q in range(n_live):
             _fill(following, base, p, q, still_open, n_open, layout, ended)
             show_next(following, layout, w.on)
+            if number == len(layout.outputs) - 2:
+                show_next_meetings(following, layout, w.on)
             distributions(late.changing[i : i + 1], state, action, layout, late, w.on, w.values, w.rates)
             w.joint[:n] = w.rates[start : start + n]
             prune(w.joint, n)

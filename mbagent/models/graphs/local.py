@@ -17,12 +17,21 @@ from mbagent.models.graphs.compiled import Graphs, build, habit_of
 from mbagent.models.graphs.evidence import Ints
 from mbagent.models.graphs.fitting import Fitted, nothing_late
 from mbagent.models.graphs.instantiate import Coupling, LocalGraphs, instantiate, with_couplings
-from mbagent.models.graphs.model import DecisionGraphModel
+from mbagent.models.graphs.model import IMPOSSIBLE, DecisionGraphModel
 from mbagent.models.graphs.search import Search
 from mbagent.models.graphs.units import Question
-from mbagent.models.graphs.windows import NEXT, relative_columns
+from mbagent.models.graphs.windows import NEXT, NEXT_MEETING, Reach, relative_columns
 from mbagent.spaces import FactoredSpace
 from mbagent.transitions import TransitionBatch, TransitionDataset
+
+LARGEST_RADIUS = 3
+"""Neighbourhoods are tried up to this radius."""
+
+SOME_ROWS, SOME_TESTS = 3000, 1000
+"""Transitions learned from and held out to choose the reach."""
+
+FORETOLD = -1e-3
+"""Mean log-probability from which on nothing is left to find."""
 
 
 class LocalGraphModel(DecisionGraphModel):
@@ -31,14 +40,14 @@ class LocalGraphModel(DecisionGraphModel):
     Args:
         space: a stack of planes; all cells of a channel have equally many values.
         n_actions: number of enumerated actions A.
-        radius: rows and columns that a neighbourhood reaches in each direction.
+        reach: how far a neighbourhood reaches; None to find out from held-out episodes.
         validation: share of episodes held out for the report; the graphs are fitted to all rows in the end.
 
     Raises:
         ValueError: the space is no stack of planes of that kind.
     """
 
-    def __init__(self, space: FactoredSpace, n_actions: int, radius: int = 1, validation: float = 0.1) -> None:
+    def __init__(self, space: FactoredSpace, n_actions: int, reach: Reach | None = None, validation: float = 0.1) -> None:
         """See the class."""
         super().__init__(space.cardinalities, n_actions, validation)
         cards = None if space.planes is None else channel_cardinalities(space)
@@ -47,8 +56,13 @@ class LocalGraphModel(DecisionGraphModel):
                 f"LocalGraphModel needs planes whose cells have equally many values in each channel, got {space.space}; "
                 "use DecisionGraphModel."
             )
-        self.board, self.radius = space.planes, radius
-        columns = relative_columns(cards, n_actions, radius)
+        self.board, self.given = space.planes, reach
+        self._forget(cards, reach or Reach())
+
+    def _forget(self, cards: tuple[int, ...], reach: Reach) -> None:
+        """Knows nothing, but how far neighbourhoods reach."""
+        self.reach, n_actions = reach, self.n_actions
+        columns = relative_columns(cards, n_actions, reach)
         nothing = [habit_of(k, n_actions, *([np.zeros(0, dtype=np.int64)] * 3)) for k in (*cards, 2, 2)]
         graphs = build(channel_layout(cards, n_actions), (), (), nothing, 1e-9)
         self.local = LocalGraphs(graphs, nothing_late(graphs), columns, cards, n_actions, ())
@@ -62,6 +76,7 @@ class LocalGraphModel(DecisionGraphModel):
         """See TransitionModel."""
         began = time.perf_counter()
         train, held_out = data.split(self.validation, seed)
+        self._forget(self.local.cardinalities, self.given or self._best_reach(train, held_out))
         self._learn(train)
         likelihood, jointly = self._jointly(held_out)
         if progress is not None:
@@ -73,6 +88,28 @@ class LocalGraphModel(DecisionGraphModel):
             progress(1.0)
         figures = {"nodes": float(len(self.local.graphs.column)), "couplings": float(len(self.local.couplings))}
         return self._report(began, (len(rows), len(held_out)), likelihood, exact, figures)
+
+    def _best_reach(self, train: TransitionBatch, held_out: TransitionBatch) -> Reach:
+        """The least reach under which held-out transitions are foretold no worse than under larger ones; from some rows."""
+        if len(held_out) == 0:
+            return Reach()
+        some, tests = (rows.select(np.arange(min(len(rows), n))) for rows, n in ((train, SOME_ROWS), (held_out, SOME_TESTS)))
+        best, logs = Reach(), self._foretold(Reach(), some, tests)
+        while best.radius < LARGEST_RADIUS and logs.mean() < FORETOLD:
+            further = self._foretold(Reach(best.radius + 1), some, tests)
+            if not _better(further, logs):
+                break
+            best, logs = Reach(best.radius + 1), further
+        if logs.mean() < FORETOLD and _better(self._foretold(best._replace(wrap=True), some, tests), logs):
+            best = best._replace(wrap=True)
+        return best
+
+    def _foretold(self, reach: Reach, train: TransitionBatch, tests: TransitionBatch) -> Floats:
+        """Log-probabilities of transitions after learning from others."""
+        self._forget(self.local.cardinalities, reach)
+        self._learn(train, jointly=False)
+        logs = self.log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
+        return np.maximum(logs, IMPOSSIBLE)
 
     def _learn(self, rows: TransitionBatch, jointly: bool = True) -> None:
         """Graphs first, each cell for itself; then what is never on together, and what hangs on what others become."""
@@ -104,20 +141,20 @@ class LocalGraphModel(DecisionGraphModel):
         Raises:
             ValueError: the channels or their values are others.
         """
-        other = LocalGraphModel(space, self.n_actions, self.radius, self.validation)
+        other = LocalGraphModel(space, self.n_actions, self.given, self.validation)
         if other.local.cardinalities != self.local.cardinalities:
             raise ValueError(
                 f"This model knows channels with {self.local.cardinalities} values, but {space.space} has "
                 f"{other.local.cardinalities}; only the rows and columns may be others."
             )
-        other.local = self.local
+        other.local, other.reach = self.local, self.reach
         other._instantiate((), ())
         return other
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """See TransitionModel."""
         couplings = np.asarray(self.local.couplings, dtype=np.int64).reshape(-1, 4)
-        state: dict[str, NDArray[Any]] = {"couplings": couplings}
+        state: dict[str, NDArray[Any]] = {"reach": np.asarray(self.reach, dtype=np.int64), "couplings": couplings}
         for name, graphs in (("local", self.local.graphs), ("late", self.local.late)):
             state.update({f"{name}.{part}": array for part, array in to_arrays(graphs).items()})
         return state
@@ -128,25 +165,30 @@ class LocalGraphModel(DecisionGraphModel):
         Raises:
             ValueError: the arrays are not those of a model of these planes and actions; nothing is changed then.
         """
-        wrong = sorted({"couplings", *(f"{name}.{part}" for name in ("local", "late") for part in Graphs._fields)} ^ set(state))
+        graph_parts = {f"{name}.{part}" for name in ("local", "late") for part in Graphs._fields}
+        wrong = sorted(({"reach", "couplings"} | graph_parts) ^ set(state))
         if wrong:
             raise ValueError(f"These weights are not those of local decision graphs (first difference: {wrong[0]!r}).")
-        cards = self.local.cardinalities
+        cards, parts = self.local.cardinalities, np.asarray(state["reach"]).reshape(-1)
+        if len(parts) != 2 or parts[0] not in range(1, LARGEST_RADIUS + 1) or parts[1] not in (0, 1):
+            raise ValueError("These weights are of neighbourhoods that reach as far as none can; the file is damaged.")
+        reach = Reach(int(parts[0]), bool(parts[1]))
+        columns = relative_columns(cards, self.n_actions, reach)
         graphs, late = (
             from_arrays(
                 {part: state[f"{name}.{part}"] for part in Graphs._fields},
                 channel_layout(cards, self.n_actions),
-                len(self.local.columns),
+                len(columns),
             )
             for name in ("local", "late")
         )
-        if not _sound(graphs, late, self.local.columns):
+        if not _sound(graphs, late, columns):
             raise ValueError("These weights ask for a next state that is not known yet; load them as they were saved.")
         couplings = tuple(Coupling(int(c), int(k), int(i), bool(e)) for c, k, i, e in np.reshape(state["couplings"], (-1, 4)))
         longest = max(self.board.height, self.board.width)
         if any(c.channel not in range(len(cards)) or c.kind not in (0, 1, 2) or abs(c.line) >= longest for c in couplings):
             raise ValueError("These weights couple cells that these planes do not have; load them into a model of the same kind.")
-        self.local = replace(self.local, graphs=graphs, late=late, couplings=couplings)
+        self.local, self.reach = LocalGraphs(graphs, late, columns, cards, self.n_actions, couplings), reach
         self._instantiate((), ())
 
 
@@ -162,4 +204,10 @@ def _sound(graphs: Graphs, late: Graphs, columns: Ints) -> bool:
     """Whether only late graphs ask for the next state."""
     asked = graphs.column[graphs.column >= 0]
     channels = columns[columns[:, 0] == NEXT, 1]
-    return bool((columns[asked, 0] != NEXT).all() and np.isin(late.changing, channels).all())
+    return bool(not np.isin(columns[asked, 0], (NEXT, NEXT_MEETING)).any() and (late.changing <= channels.max() + 1).all())
+
+
+def _better(logs: Floats, others: Floats) -> bool:
+    """Whether log-probabilities are higher than others, of the same transitions, by more than chance."""
+    gain = logs - others
+    return bool(len(gain) > 1 and gain.mean() > 3.0 * gain.std(ddof=1) / np.sqrt(len(gain)))

@@ -20,6 +20,10 @@ Ints: TypeAlias = NDArray[np.int64]
 Bools: TypeAlias = NDArray[np.bool_]
 
 
+BEYOND = -1
+"""Stands for a channel where a meeting is with the border."""
+
+
 class Layout(NamedTuple):
     """Where units and columns lie in a state; for compiled kernels, too.
 
@@ -50,6 +54,7 @@ class Layout(NamedTuple):
     n_actions: int
     cells: Ints
     meetings: Ints
+    next_meetings: Ints
     coupled_first: Ints
     coupled: Ints
     exactly: Bools
@@ -72,6 +77,7 @@ def lay_out(cardinalities: Sequence[int], groups: Sequence[Sequence[int]], n_act
         len(cardinalities),
         int(n_actions),
         np.zeros((0, 0, 0), dtype=np.int64),
+        np.zeros((0, 6), dtype=np.int64),
         np.zeros((0, 6), dtype=np.int64),
         np.zeros(1, dtype=np.int64),
         np.zeros(0, dtype=np.int64),

@@ -7,58 +7,114 @@ alike share what they know (the paper's section 5). Shapes: N transitions, C cha
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from typing import TypeAlias, TypeVar
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mbagent.models.graphs.units import BEYOND
 
 Ints: TypeAlias = NDArray[np.int64]
 _T = TypeVar("_T", bound=np.generic)
 Bools: TypeAlias = NDArray[np.bool_]
 
-CELL, BORDER, ACTION, MEETING, NEXT = 0, 1, 2, 3, 4
-"""Kinds of relative columns: (CELL, channel, value, rows below, columns right, 0, 0), (BORDER, rows below, columns right, 0 ...),
-(ACTION, action, 0 ...), (MEETING, channel, value, channel, value, rows below, columns right), and (NEXT, ...), a CELL of the next
-state."""
+CELL, BORDER, ACTION, MEETING, NEXT, WRAP, NEXT_MEETING = 0, 1, 2, 3, 4, 5, 6
+"""Kinds of relative columns, and what follows the kind:
+
+- CELL: channel, value, rows below, columns to the right;
+- BORDER: rows below, columns to the right;
+- ACTION: action;
+- MEETING: channel, value, channel (``BEYOND``: what lies beyond the border), value, rows below, columns to the right;
+- NEXT, NEXT_MEETING: a CELL and a MEETING of the next state;
+- WRAP: a CELL that lies beyond the border, and so at the other end.
+"""
+
+
+class Reach(NamedTuple):
+    """How far a neighbourhood reaches.
+
+    Attributes:
+        radius: rows and columns in each direction.
+        wrap: whether it goes on at the other end of the board.
+    """
+
+    radius: int = 1
+    wrap: bool = False
+
 
 NEXT_RADIUS = 2
 """Rows and columns that a neighbourhood in the next state reaches: two places that a thing may go to lie so far apart."""
 
 
-def relative_columns(cardinalities: Sequence[int], n_actions: int, radius: int) -> Ints:
+def relative_columns(cardinalities: Sequence[int], n_actions: int, reach: Reach) -> Ints:
     """All relative columns, int64 [D, 7]; see above.
 
     Args:
         cardinalities: number of values of each channel's cells, length C.
         n_actions: number of actions A.
-        radius: rows and columns that a neighbourhood reaches in each direction.
+        reach: of neighbourhoods.
     """
-    reach = range(-radius, radius + 1)
-    offsets = list(itertools.product(reach, reach))
+    near = range(-reach.radius, reach.radius + 1)
+    offsets = list(itertools.product(near, near))
     shown = [(c, v) for c, k in enumerate(cardinalities) for v in (range(k) if k != 2 else (1,))]
     columns = [(CELL, c, v, dy, dx, 0, 0) for dy, dx in offsets for c, v in shown]
     columns += [(BORDER, dy, dx, 0, 0, 0, 0) for dy, dx in offsets if (dy, dx) != (0, 0)]
     columns += [(ACTION, action, 0, 0, 0, 0, 0) for action in range(n_actions)]
-    for i, first in enumerate(shown):
-        for second in shown[i:]:
-            near = itertools.product((-1, 0, 1), (-1, 0, 1))
-            columns += [(MEETING, *first, *second, dy, dx) for dy, dx in near if first != second or (dy, dx) >= (0, 0)]
+    meetings = list(_meetings(shown))
+    columns += [(MEETING, *meeting) for meeting in meetings]
     further = range(-NEXT_RADIUS, NEXT_RADIUS + 1)
     columns += [(NEXT, c, v, dy, dx, 0, 0) for dy, dx in itertools.product(further, further) for c, v in shown]
+    columns += [(NEXT_MEETING, *meeting) for meeting in meetings]
+    if reach.wrap:
+        columns += [(WRAP, c, v, dy, dx, 0, 0) for dy, dx in offsets for c, v in shown if (dy, dx) != (0, 0)]
     return np.asarray(columns, dtype=np.int64).reshape(-1, 7)
 
 
-def known_columns(columns: Ints, planes: Ints) -> Ints:
-    """Numbers of the relative columns that are about values met in planes [N, C, H, W]."""
-    met = [np.unique(planes[:, channel]) for channel in range(planes.shape[1])]
+def _meetings(shown: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int, int, int, int, int]]:
+    """Two things at one place or side by side, and a thing at one of the four sides."""
+    for i, first in enumerate(shown):
+        for second in shown[i:]:
+            for dy, dx in itertools.product((-1, 0, 1), (-1, 0, 1)):
+                if first != second or (dy, dx) >= (0, 0):
+                    yield (*first, *second, dy, dx)
+        for dy, dx in ((-1, 0), (0, 1), (1, 0), (0, -1)):
+            yield (*first, BEYOND, 0, dy, dx)
 
-    def known(column: Ints) -> bool:
-        if column[0] in (CELL, NEXT):
-            return bool(column[2] in met[column[1]])
-        return column[0] != MEETING or bool(column[2] in met[column[1]] and column[4] in met[column[3]])
 
-    return np.flatnonzero([known(column) for column in columns])
+def known_columns(columns: Ints, before: Ints, after: Ints) -> Ints:
+    """Numbers of the relative columns that may tell something, by what was met.
+
+    Values that were never met tell nothing, nor do meetings of channels that only repeat another channel's past, or that are
+    the same all over the board.
+
+    Args:
+        columns: int64 [D, 7].
+        before: planes, int64 [N, C, H, W].
+        after: those of the next states.
+    """
+    n_channels = before.shape[1]
+    met = [set(np.unique(before[:, channel]).tolist()) for channel in range(n_channels)]
+    live = {BEYOND} | {
+        c
+        for c in range(n_channels)
+        if not (before[:, c] == before[:, c, :1, :1]).all()
+        and not any(_repeats(after[:, c], before[:, other]) for other in range(n_channels) if other != c)
+    }
+
+    def known(kind: int, channel: int, value: int, other: int, second: int) -> bool:
+        if kind in (CELL, NEXT, WRAP):
+            return value in met[channel]
+        if kind not in (MEETING, NEXT_MEETING):
+            return True
+        return channel in live and other in live and value in met[channel] and (other == BEYOND or second in met[other])
+
+    return np.flatnonzero([known(*column[:5]) for column in columns.tolist()])
+
+
+def _repeats(after: Ints, before: Ints) -> bool:
+    some = slice(0, 100)
+    return bool((after[some] == before[some]).all() and (after == before).all())
 
 
 def column_values(columns: Ints, planes: Ints, actions: Ints, after: Ints | None = None) -> Bools:
@@ -73,19 +129,30 @@ def column_values(columns: Ints, planes: Ints, actions: Ints, after: Ints | None
     n, _, height, width = planes.shape
     table = np.empty((len(columns), n, height, width), dtype=np.bool_)
     inside = np.ones((height, width), dtype=np.bool_)
-    for d, column in enumerate(columns):
-        if column[0] == CELL:
-            table[d] = shifted(planes[:, column[1]] == column[2], column[3], column[4])
-        elif column[0] == NEXT:
-            assert after is not None
-            table[d] = shifted(after[:, column[1]] == column[2], column[3], column[4])
-        elif column[0] == BORDER:
-            table[d] = ~shifted(inside[None], column[1], column[2])
-        elif column[0] == ACTION:
-            table[d] = (actions == column[1])[:, None, None]
+    for d, (kind, *parts) in enumerate(columns.tolist()):
+        if kind == BORDER:
+            table[d] = ~shifted(inside[None], parts[0], parts[1])
+        elif kind == ACTION:
+            table[d] = (actions == parts[0])[:, None, None]
+        elif kind in (MEETING, NEXT_MEETING):
+            table[d] = far_value(columns[d], planes, actions, after)[:, None, None]
         else:
-            table[d] = meets(planes, column[1:])[:, None, None]
+            shown = _shown(kind, planes, after)[:, parts[0]] == parts[1]
+            table[d] = wrapped(shown, *parts[2:4]) if kind == WRAP else shifted(shown, *parts[2:4])
     return np.ascontiguousarray(table.reshape(len(columns), n * height * width).T)
+
+
+def _shown(kind: int, planes: Ints, after: Ints | None) -> Ints:
+    if kind not in (NEXT, NEXT_MEETING):
+        return planes
+    assert after is not None
+    return after
+
+
+def far_value(column: Ints, planes: Ints, actions: Ints, after: Ints | None) -> Bools:
+    """As ``column_values``, for a column that is the same at all positions, bool [N]."""
+    kind = int(column[0])
+    return actions == column[1] if kind == ACTION else meets(_shown(kind, planes, after), column[1:])
 
 
 def shifted(plane: NDArray[_T], below: int, right: int) -> NDArray[_T]:
@@ -99,10 +166,19 @@ def shifted(plane: NDArray[_T], below: int, right: int) -> NDArray[_T]:
     return result
 
 
+def wrapped(plane: NDArray[_T], below: int, right: int) -> NDArray[_T]:
+    """What lies beyond the border so far from each position of [N, H, W], and so at the other end; 0 where nothing is beyond."""
+    around = np.roll(plane, (-below, -right), axis=(1, 2))
+    inside = shifted(np.ones((1, *plane.shape[1:]), dtype=np.bool_), below, right)
+    return np.where(inside, np.zeros_like(around), around)
+
+
 def meets(planes: Ints, meeting: Ints) -> Bools:
     """Whether, anywhere, one channel has a value and the other has its value so far from there, bool [N]."""
     first, value, second, other, below, right = (int(part) for part in meeting)
-    found: Bools = ((planes[:, first] == value) & shifted(planes[:, second] == other, below, right)).any(axis=(1, 2))
+    inside = np.ones((1, *planes.shape[2:]), dtype=np.bool_)
+    there = ~shifted(inside, below, right) if second == BEYOND else shifted(planes[:, second] == other, below, right)
+    found: Bools = ((planes[:, first] == value) & there).any(axis=(1, 2))
     return found
 
 
@@ -110,5 +186,6 @@ def column_kinds(columns: Ints) -> Ints:
     """Which kind of thing each relative column is, int64 [D]: a channel's cells (now, next), border, action, meeting."""
     kind = columns[:, 0]
     n_channels = int(columns[kind == CELL, 1].max(initial=0)) + 1
-    kinds = np.where(kind == CELL, columns[:, 1], np.where(kind == NEXT, n_channels + columns[:, 1], 2 * n_channels + kind))
+    of_channel = np.isin(kind, (CELL, NEXT, WRAP))
+    kinds = np.where(of_channel, columns[:, 1] + n_channels * (kind == NEXT), 2 * n_channels + kind)
     return kinds.astype(np.int64)

@@ -11,7 +11,19 @@ from gymnasium import spaces
 from mbagent import ModelLearningAgent
 from mbagent.models.graphs import DecisionGraphModel, LocalGraphModel
 from mbagent.models.graphs.instantiate import COLUMN, WHOLE, Coupling
-from mbagent.models.graphs.windows import ACTION, BORDER, CELL, NEXT, column_kinds, column_values, relative_columns
+from mbagent.models.graphs.units import BEYOND
+from mbagent.models.graphs.windows import (
+    ACTION,
+    BORDER,
+    CELL,
+    NEXT,
+    NEXT_MEETING,
+    WRAP,
+    Reach,
+    column_kinds,
+    column_values,
+    relative_columns,
+)
 from mbagent.spaces import FactoredSpace
 from mbagent.transitions import TransitionDataset
 from mbagent_envs import FlierCatcher, Maneuverer
@@ -26,7 +38,7 @@ def planes(*shape: int) -> FactoredSpace:
 def test_columns_are_what_lies_around_each_position() -> None:
     rng = np.random.default_rng(0)
     board, actions = rng.integers(2, size=(4, 2, 3, 5)), rng.integers(3, size=4)
-    columns = relative_columns((2, 2), 3, 1)
+    columns = relative_columns((2, 2), 3, Reach(1, wrap=True))
     after = rng.integers(2, size=board.shape)
     table = column_values(columns, board, actions, after).reshape(4, 3, 5, len(columns))
 
@@ -43,9 +55,21 @@ def test_columns_are_what_lies_around_each_position() -> None:
                 expected = not (0 <= y + parts[0] < 3 and 0 <= x + parts[1] < 5)
             elif kind == ACTION:
                 expected = bool(actions[n] == parts[0])
+            elif kind == WRAP:
+                i, j = y + parts[2], x + parts[3]
+                expected = not (0 <= i < 3 and 0 <= j < 5) and cell(n, parts[0], i % 3, j % 5)
             else:
                 first, _, second, _, below, right = parts
-                expected = any(cell(n, first, i, j) and cell(n, second, i + below, j + right) for i, j in np.ndindex(3, 5))
+                shown = after if kind == NEXT_MEETING else board
+
+                def outside(i: int, j: int) -> bool:
+                    return not (0 <= i < 3 and 0 <= j < 5)
+
+                expected = any(
+                    cell(n, first, i, j, shown)
+                    and (outside(i + below, j + right) if second == BEYOND else cell(n, second, i + below, j + right, shown))
+                    for i, j in np.ndindex(3, 5)
+                )
             assert table[n, y, x, d] == expected, (kind, parts)
     assert len(np.unique(columns, axis=0)) == len(columns)
     assert len(column_kinds(columns)) == len(columns)
