@@ -36,6 +36,9 @@ from mbagent_envs.random_keys import derive, uniforms
 IMPOSSIBLE = -200.0
 """Log-probability that an impossible transition is charged with when models are compared."""
 
+ENOUGH, MOST_SPLITS = 5, 10
+"""So many held-out rare events tell whether they are events at all; where one split has fewer, others follow, up to so many."""
+
 _EVENT = 1 << 33
 """Salt of the random number that decides whether the event happens."""
 
@@ -66,8 +69,7 @@ class DecisionGraphModel(BaseTransitionModel):
         """See TransitionModel."""
         began = time.perf_counter()
         train, held_out = data.split(self.validation, seed)
-        rows = data.rows()
-        events = self._events(rows, train, held_out)
+        rows, events = data.rows(), self._events(data, seed)
         if progress is not None:
             progress(0.4)
         flagged = flag_events(train.states, train.next_states) & events.any()
@@ -105,18 +107,22 @@ class DecisionGraphModel(BaseTransitionModel):
             log={"questions": float(len(splits)), "splits": float(np.mean(splits)) if splits else 0.0, **figures},
         )
 
-    def _events(self, rows: TransitionBatch, train: TransitionBatch, held_out: TransitionBatch) -> Bools:
+    def _events(self, data: TransitionDataset, seed: int) -> Bools:
         """Which rows are rare events; none if held-out transitions are foretold better without."""
-        events, seen = flag_events(rows.states, rows.next_states), flag_events(train.states, train.next_states)
-        if not (events.any() and seen.any()):
-            return np.zeros(len(rows), dtype=np.bool_)
-        with_events, without = (
-            self._likelihood(
-                fit_graphs(self.cardinalities, self.n_actions, train, flags, in_pairs=False, jointly=False), held_out
+        rows = data.rows()
+        events, gain, tested = flag_events(rows.states, rows.next_states), 0.0, 0
+        for split in range(MOST_SPLITS if events.any() else 0):
+            train, held_out = data.split(self.validation, seed + split)
+            seen = flag_events(train.states, train.next_states)
+            with_events, without = (
+                self._likelihood(fit_graphs(self.cardinalities, self.n_actions, train, flags, False, False), held_out)
+                for flags in (seen, np.zeros_like(seen))
             )
-            for flags in (seen, np.zeros_like(seen))
-        )
-        return events if with_events > without else np.zeros_like(events)
+            gain += (with_events - without) * len(held_out)
+            tested += int(flag_events(held_out.states, held_out.next_states).sum())
+            if tested >= ENOUGH:
+                break
+        return events & (gain > 0.0)
 
     def _likelihood(self, fitted: Fitted, rows: TransitionBatch) -> float:
         """Mean log-probability of transitions; the impossible counts as ``IMPOSSIBLE``."""
