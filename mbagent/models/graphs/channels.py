@@ -53,7 +53,7 @@ SOME_CELLS = 100_000
 
 def channel_layout(cardinalities: Sequence[int], n_actions: int) -> Layout:
     """Channels as the factors of a layout; its own columns mean nothing."""
-    return lay_out(cardinalities, (), n_actions)
+    return lay_out(cardinalities, (), n_actions, ordinal=False)
 
 
 class PlaneTable:

@@ -116,8 +116,8 @@ def build(layout: Layout, asked: Sequence[Question], found: Sequence[Search], ha
     for question, search in zip(asked, found, strict=True):
         first = nodes.graph(search, prior)
         entries += [
-            (int(pairs[question.unit] + pair), question.value, int(node))
-            for pair, node in zip(question.pairs, first, strict=True)
+            (int(pairs[question.unit] + pair), int(value), int(node))
+            for pair, value, node in zip(question.pairs, question.values, first, strict=True)
         ]
     rates = np.asarray(nodes.rates, dtype=np.float64).reshape(-1, 2)
     return Graphs(
@@ -207,7 +207,8 @@ def show(state: Ints, action: int, layout: Layout, on: Bools) -> None:
     """Writes which columns are on to ``on`` [D]."""
     n = len(layout.factor)
     for column in range(n):
-        on[column] = state[layout.factor[column]] == layout.value[column]
+        value = state[layout.factor[column]]
+        on[column] = layout.value[column] <= value <= layout.top[column]
     for other in range(layout.n_actions):
         on[n + other] = other == action
     n += layout.n_actions
@@ -243,7 +244,8 @@ def show_next(following: Ints, layout: Layout, on: Bools) -> None:
     """Writes which columns a next state [F] has on, after those of the state in ``on``."""
     n = n_columns(layout)
     for column in range(len(layout.factor)):
-        on[n + column] = following[layout.factor[column]] == layout.value[column]
+        value = following[layout.factor[column]]
+        on[n + column] = layout.value[column] <= value <= layout.top[column]
 
 
 @compiled

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mbagent.models.graphs import draws
 from mbagent.models.graphs.compiled import Graphs
-from mbagent.models.graphs.units import Layout
+from mbagent.models.graphs.units import Layout, shown
 from mbagent.transitions import TransitionBatch
 
 Ints: TypeAlias = NDArray[np.int64]
@@ -47,12 +47,13 @@ class Asked(NamedTuple):
 def probabilities(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Floats:
     """Probability of each state column after each row, each for itself, [N, D']."""
     sizes = np.full(layout.n_factors, 2, dtype=np.int64)
-    np.maximum.at(sizes, layout.factor, layout.value + 1)
+    np.maximum.at(sizes, layout.factor, layout.top + 1)
     start = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     probs = np.empty((len(rows), int(start[-1])))
     draws.marginals(rows.states, rows.actions, layout, graphs, start, probs)
-    result: Floats = probs[:, start[layout.factor] + layout.value]
-    return result
+    total = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(probs, axis=1)], axis=1)
+    result: Floats = total[:, start[layout.factor] + layout.top + 1] - total[:, start[layout.factor] + layout.value]
+    return result.clip(0.0, 1.0)
 
 
 def go_together(error: Floats, other: Floats, spread: Floats, other_spread: Floats, n_tried: int) -> bool:
@@ -94,7 +95,7 @@ def _dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, owner: Int
     probs = probabilities(layout, graphs, rows)
     spread = probs * (1.0 - probs)
     uncertain = np.flatnonzero(spread.sum(axis=0) > UNCERTAIN)
-    error = (rows.next_states[:, layout.factor[uncertain]] == layout.value[uncertain]) - probs[:, uncertain]
+    error = shown(layout, rows.next_states, uncertain) - probs[:, uncertain]
     variance = spread[:, uncertain].T @ spread[:, uncertain]
     unit, coupling = owner[uncertain], layout.coupling_of[owner[uncertain]]
     earlier = unit[:, None] < unit

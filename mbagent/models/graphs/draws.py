@@ -164,7 +164,7 @@ def _show_unit(unit: int, following: Ints, w: Work, layout: Layout) -> None:
     for member in range(layout.first[unit], layout.first[unit + 1]):
         factor = layout.members[member]
         for column in range(w.shown[factor], w.shown[factor + 1]):
-            w.on[n + column] = following[factor] == layout.value[column]
+            w.on[n + column] = layout.value[column] <= following[factor] <= layout.top[column]
 
 
 @compiled

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -26,6 +26,7 @@ from mbagent.models.graphs.units import (
     distinct,
     is_lone_bit,
     lay_out,
+    shown,
     unit_values,
 )
 from mbagent.transitions import TransitionBatch
@@ -66,11 +67,14 @@ class _Table:
         layout: the units.
         rows: N transitions.
         events: which of them are rare events, bool [N].
+        moving: factors that are asked how far they move.
     """
 
-    def __init__(self, layout: Layout, rows: TransitionBatch, events: Bools) -> None:
+    def __init__(self, layout: Layout, rows: TransitionBatch, events: Bools, moving: Collection[int]) -> None:
         """See the class."""
         self.layout, self.rows = layout, rows
+        lone = np.flatnonzero(np.diff(layout.first) == 1)
+        self.moving = lone[np.isin(layout.members[layout.first[lone]], list(moving))]
         flags = np.stack([rows.terminated, events], axis=1).astype(np.int64)
         self.now = np.concatenate([unit_values(layout, rows.states), np.zeros_like(flags)], axis=1)
         self.then = np.concatenate([unit_values(layout, rows.next_states), flags], axis=1)
@@ -79,7 +83,11 @@ class _Table:
 
     def ask(self, unit: int, which: Ints) -> list[Question]:
         """The questions about a unit, of some rows."""
-        return ask(unit, int(self.layout.outputs[unit]), self.seen(unit).select(which))
+        return self.questions(unit, self.seen(unit).select(which))
+
+    def questions(self, unit: int, seen: Seen) -> list[Question]:
+        """The questions about a unit, of rows with whatever looks."""
+        return ask(unit, int(self.layout.outputs[unit]), seen, unit in self.moving)
 
     def seen(self, unit: int) -> Seen:
         """A unit's values in all rows."""
@@ -112,6 +120,7 @@ def fit_graphs(
     events: Bools,
     in_pairs: bool = True,
     jointly: bool = True,
+    moving: Collection[int] = (),
 ) -> Fitted:
     """Fits everything.
 
@@ -122,10 +131,11 @@ def fit_graphs(
         events: which of them are rare events, bool [N].
         in_pairs: whether to look for causes that matter only together, which takes most of the time.
         jointly: whether to look for units that hang on what others become.
+        moving: factors that are asked how far they move, and not where they go.
     """
     groups = find_groups(cardinalities, rows.states, rows.next_states, ~events)
     layout = lay_out(cardinalities, groups, n_actions)
-    table, usual = _Table(layout, rows, events), np.flatnonzero(~events)
+    table, usual = _Table(layout, rows, events, moving), np.flatnonzero(~events)
     last = len(layout.outputs) - 1
     asked_of = {unit: np.arange(len(rows)) if unit == last else usual for unit in range(last + 1)}
     graphs, asked, found = _graphs(table, asked_of, usual, True, in_pairs)
@@ -150,9 +160,9 @@ def _late_graphs(
     for unit, columns in find_dependent(layout, graphs, rows, usual):
         needed = draws.uncertain(rows.states[usual], rows.actions[usual], layout, graphs, np.asarray([unit]))[:, 0]
         some = table.seen(unit).select(usual[needed])
-        following = rows.next_states[usual[needed]][:, layout.factor[columns]] == layout.value[columns]
+        following = shown(layout, rows.next_states[usual[needed]], columns)
         first, pattern = distinct(np.concatenate([some.pattern[:, None], following], axis=1))
-        asked = ask(unit, int(layout.outputs[unit]), replace(some, pattern=pattern))
+        asked = table.questions(unit, replace(some, pattern=pattern))
         more_kinds = np.concatenate([kinds, kinds.max(initial=0) + 1 + kinds[columns]])
         more = np.concatenate([table.columns[some.pattern[first]], following[first]], axis=1)
         found = find_splits([q.head for q in asked], more, more_kinds, layout.n_actions, in_pairs)

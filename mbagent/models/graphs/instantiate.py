@@ -73,7 +73,7 @@ def instantiate(local: LocalGraphs, board: PlaneLayout) -> tuple[Layout, Graphs,
     asked = np.concatenate([local.graphs.column, local.late.column])
     used = np.unique(asked[asked >= 0])
     meetings, later = (used[local.columns[used, 0] == kind] for kind in (MEETING, NEXT_MEETING))
-    layout = lay_out([int(c) for c in cardinalities], (), local.n_actions)
+    layout = lay_out([int(c) for c in cardinalities], (), local.n_actions, ordinal=False)
     now, then = (np.ascontiguousarray(local.columns[numbers, 1:]) for numbers in (meetings, later))
     layout = with_couplings(layout._replace(cells=cells, meetings=now, next_meetings=then), local.couplings)
     numbers = {int(d): len(layout.factor) + layout.n_actions + i for i, d in enumerate(meetings)}

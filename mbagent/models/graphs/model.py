@@ -39,6 +39,9 @@ IMPOSSIBLE = -200.0
 ENOUGH, MOST_SPLITS = 5, 10
 """So many held-out rare events tell whether they are events at all; where one split has fewer, others follow, up to so many."""
 
+MOST_COUNTS = 20_000_000
+"""Contexts times columns of a question about how far a factor moves."""
+
 _EVENT = 1 << 33
 """Salt of the random number that decides whether the event happens."""
 
@@ -73,12 +76,13 @@ class DecisionGraphModel(BaseTransitionModel):
         if progress is not None:
             progress(0.4)
         flagged = flag_events(train.states, train.next_states) & events.any()
-        self.fitted = fit_graphs(self.cardinalities, self.n_actions, train, flagged)
+        moving = self._moving(train, flagged, held_out)
+        self.fitted = fit_graphs(self.cardinalities, self.n_actions, train, flagged, moving=moving)
         likelihood, jointly = self._jointly(held_out)
         if progress is not None:
             progress(0.7)
         exact = self._exact_match(held_out)
-        self.fitted = fit_graphs(self.cardinalities, self.n_actions, rows, events, jointly=jointly)
+        self.fitted = fit_graphs(self.cardinalities, self.n_actions, rows, events, jointly=jointly, moving=moving)
         if progress is not None:
             progress(1.0)
         figures = {"nodes": float(len(self.fitted.usual.column)), "events": float(events.sum())}
@@ -123,6 +127,20 @@ class DecisionGraphModel(BaseTransitionModel):
             if tested >= ENOUGH:
                 break
         return events & (gain > 0.0)
+
+    def _moving(self, train: TransitionBatch, events: Bools, held_out: TransitionBatch) -> list[int]:
+        """Factors of which held-out values are foretold better by asking how far they move than where they go."""
+        n_contexts, n_columns = self.n_actions * max(self.cardinalities, default=0), 2 * sum(self.cardinalities)
+        every = [f for f, cardinality in enumerate(self.cardinalities) if cardinality > 2]
+        if not every or n_contexts * n_columns > MOST_COUNTS or len(held_out) == 0:
+            return []
+        start, logs = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64), []
+        for moving in ((), every):
+            self.fitted = fit_graphs(self.cardinalities, self.n_actions, train, events, False, False, moving)
+            probs = self.marginals(held_out.states, held_out.actions)
+            chosen = np.take_along_axis(probs, start[every] + held_out.next_states[:, every], axis=1)
+            logs.append(np.log(chosen.clip(1e-9)).sum(axis=0))
+        return [f for f, gain in zip(every, logs[1] - logs[0], strict=True) if gain > 0.0]
 
     def _likelihood(self, fitted: Fitted, rows: TransitionBatch) -> float:
         """Mean log-probability of transitions; the impossible counts as ``IMPOSSIBLE``."""

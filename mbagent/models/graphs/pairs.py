@@ -33,8 +33,8 @@ FIRST = 3.0
 LEAST = 1.0
 """Least price of a cause, nats, however likely the prior makes it."""
 
-MOST_COLUMNS = 1500
-"""Pairs are looked for among so many columns at most."""
+MOST_WORK = 40_000_000_000
+"""Pairs of columns are looked for in a context as long as rows times columns times columns stay below this."""
 
 TELLING = 2
 """Pairs from which on their kinds tell what kinds the next ones are of."""
@@ -64,8 +64,6 @@ class PairSearch:
 
     def divide(self, searches: Sequence[Search]) -> bool:
         """One round over all heads that changed since the last; whether any pair was found."""
-        if self.table.shape[1] > MOST_COLUMNS:
-            return False
         prior, found = self._prior(), False
         for h, search in enumerate(searches):
             if not search.open or self._seen.get(h) == len(search.splits):
@@ -127,7 +125,7 @@ def find_pairs(head: Head, contexts: Sequence[int], table: Bools, prior: Floats,
     found: list[Pair] = []
     for context in contexts:
         rows = head.context == context
-        if head.seen[rows].sum() >= FEWEST:
+        if head.seen[rows].sum() >= FEWEST and rows.sum() * table.shape[1] ** 2 < MOST_WORK:
             found += _in_context(context, table[head.rows[rows]], head.seen[rows], head.came[rows], prior, patterns, tables)
     best = max(found, default=None)
     return [] if best is None else [pair for pair in found if pair.context == best.context]

@@ -1,13 +1,14 @@
 """From transitions to questions: which value of which unit comes, asked of the rows in which it is possible at all.
 
 A *unit* is a factor, or a group of bits of which exactly one is on; ``terminated`` is one more unit, and so is whether a
-rare event happens. A *column* is on or off: a bit, one value of a factor with more than two, or an action.
+rare event happens. A *column* is on or off: a bit, one value of a factor with more than two, whether it has at least some
+value, or an action.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -31,7 +32,7 @@ class Layout(NamedTuple):
         outputs: number of values of each unit, int64 [U]; the last two units are ``terminated`` and the event.
         first: where each unit's factors begin in ``members``, int64 [U + 1].
         members: factors of each unit; several for a group, one for a factor, none for the last two.
-        factor, value: what each state column stands for, int64 [D'].
+        factor, value, top: what each state column stands for, int64 [D']: that a factor's value lies from ``value`` to ``top``.
         n_factors: number of factors F.
         n_actions: number of actions A.
         cells: where the observation is a stack of planes, the factor of each channel in each row and column, int64 [C, H, W];
@@ -50,6 +51,7 @@ class Layout(NamedTuple):
     members: Ints
     factor: Ints
     value: Ints
+    top: Ints
     n_factors: int
     n_actions: int
     cells: Ints
@@ -61,19 +63,31 @@ class Layout(NamedTuple):
     coupling_of: Ints
 
 
-def lay_out(cardinalities: Sequence[int], groups: Sequence[Sequence[int]], n_actions: int) -> Layout:
-    """Units of factors: the groups first, then all other factors in their order, then ``terminated`` and the event."""
+MOST_STEPS = 128
+"""Columns "at least so much" of one factor; of more values, evenly spaced ones have one."""
+
+
+def lay_out(cardinalities: Sequence[int], groups: Sequence[Sequence[int]], n_actions: int, ordinal: bool = True) -> Layout:
+    """Units of factors: the groups first, then all other factors in their order, then ``terminated`` and the event.
+
+    Args:
+        cardinalities: number of values of each factor.
+        groups: factors of each group.
+        n_actions: number of actions A.
+        ordinal: whether there are columns for a factor having at least some value.
+    """
     grouped = {f for group in groups for f in group}
     members = [*(list(group) for group in groups), *([f] for f in range(len(cardinalities)) if f not in grouped), [], []]
     sizes = [len(group) for group in groups] + [cardinalities[unit[0]] for unit in members[len(groups) : -2]] + [2, 2]
-    columns = [(f, v) for f, c in enumerate(cardinalities) for v in (range(c) if c != 2 else (1,))]
-    factor, value = np.asarray(columns, dtype=np.int64).reshape(-1, 2).T
+    columns = [column for f, c in enumerate(cardinalities) for column in _columns_of(f, c, ordinal)]
+    factor, value, top = np.asarray(columns, dtype=np.int64).reshape(-1, 3).T
     return Layout(
         np.asarray(sizes, dtype=np.int64),
         np.concatenate([[0], np.cumsum([len(unit) for unit in members])]).astype(np.int64),
         np.asarray([f for unit in members for f in unit], dtype=np.int64),
         np.ascontiguousarray(factor),
         np.ascontiguousarray(value),
+        np.ascontiguousarray(top),
         len(cardinalities),
         int(n_actions),
         np.zeros((0, 0, 0), dtype=np.int64),
@@ -84,6 +98,24 @@ def lay_out(cardinalities: Sequence[int], groups: Sequence[Sequence[int]], n_act
         np.zeros(0, dtype=np.bool_),
         np.full(len(sizes), -1, dtype=np.int64),
     )
+
+
+def _columns_of(factor: int, cardinality: int, ordinal: bool) -> list[tuple[int, int, int]]:
+    if cardinality == 2:
+        return [(factor, 1, 1)]
+    columns = [(factor, v, v) for v in range(cardinality)]
+    if ordinal:
+        steps = np.unique(np.linspace(1, cardinality - 2, min(MOST_STEPS, max(cardinality - 2, 0))).astype(np.int64))
+        columns += [(factor, int(v), cardinality - 1) for v in steps]
+    return columns
+
+
+def shown(layout: Layout, states: Ints, columns: Ints | None = None) -> Bools:
+    """Which state columns are on in states [B, F], bool [B, D'], or [B, K] of those ``columns`` [K]."""
+    which = np.arange(len(layout.factor)) if columns is None else columns
+    values = states[:, layout.factor[which]]
+    result: Bools = (values >= layout.value[which]) & (values <= layout.top[which])
+    return result
 
 
 def coupled_layout(layout: Layout, couplings: Sequence[Ints], exactly: Sequence[bool] | None = None) -> Layout:
@@ -117,7 +149,7 @@ def unit_values(layout: Layout, states: Ints) -> Ints:
 def column_table(layout: Layout, states: Ints, actions: Ints) -> Bools:
     """Which columns are on, bool [B, D]: those of states [B, F], then those of actions [B]."""
     return np.concatenate(
-        [states[:, layout.factor] == layout.value, actions[:, None] == np.arange(layout.n_actions)],
+        [shown(layout, states), actions[:, None] == np.arange(layout.n_actions)],
         axis=1,
     )
 
@@ -140,7 +172,8 @@ def column_kinds(layout: Layout, states: Ints, changing: Bools) -> Ints:
     for unit in np.flatnonzero(np.diff(layout.first) * (layout.outputs > 2)):
         of_factor[layout.members[layout.first[unit] : layout.first[unit + 1]]] = unit
     owner = of_factor[layout.factor]
-    kinds[:n_columns][owner >= 0] = 4 + owner[owner >= 0]
+    steps = np.where(layout.top > layout.value, len(layout.outputs), 0)
+    kinds[:n_columns][owner >= 0] = (4 + owner + steps)[owner >= 0]
     still = np.flatnonzero((owner < 0) & ~changing[layout.factor])
     if len(still) == 0:
         return kinds
@@ -155,17 +188,17 @@ def column_kinds(layout: Layout, states: Ints, changing: Bools) -> Ints:
 
 @dataclass(frozen=True)
 class Question:
-    """Whether a unit takes a value, in the contexts (action, present value) in which that is possible.
+    """Whether a unit takes a value, or moves so far, in the contexts (action, present value) in which that is possible.
 
     Attributes:
         unit: number of the unit.
-        value: the value; 1 for a binary unit.
+        values: the value in each context, int64 [C].
         pairs: action times cardinality plus present value, of each context, int64 [C], ascending.
         head: the rows.
     """
 
     unit: int
-    value: int
+    values: Ints
     pairs: Ints
     head: Head
 
@@ -191,36 +224,53 @@ class Seen:
         return Seen(self.pattern[rows], self.actions[rows], self.now[rows], self.then[rows])
 
 
-def ask(unit: int, cardinality: int, seen: Seen) -> list[Question]:
+def ask(unit: int, cardinality: int, seen: Seen, moves: bool = False) -> list[Question]:
     """The questions about one unit; none if it never changes.
 
     Args:
         unit: its number.
         cardinality: number of its values.
         seen: the rows to ask.
+        moves: whether to ask how far it moves, of all values at once, and not where it goes; after the last value comes the
+            first.
     """
     if (seen.now == seen.then).all():
         return []
-    pair = seen.actions * cardinality + seen.now
     if cardinality == 2:
-        return [_question(unit, 1, cardinality, pair, seen)]
-    asked = []
+        return [_question(unit, seen.then, 1, cardinality, seen)]
+    if moves:
+        return _moves(unit, cardinality, seen)
+    pair, asked = seen.actions * cardinality + seen.now, []
     for value in np.unique(seen.then[seen.now != seen.then]):
         leading = np.unique(pair[seen.then == value])
         leading = leading[leading % cardinality != value]
-        rows = np.flatnonzero(np.isin(pair, leading))
-        asked.append(_question(unit, int(value), cardinality, pair[rows], seen.select(rows)))
+        some = seen.select(np.flatnonzero(np.isin(pair, leading)))
+        asked.append(_question(unit, some.then, int(value), cardinality, some))
     return asked
 
 
-def _question(unit: int, value: int, cardinality: int, pair: Ints, seen: Seen) -> Question:
-    n, came = np.bincount(seen.pattern), np.bincount(seen.pattern, weights=seen.then == value).astype(np.int64)
+def _moves(unit: int, cardinality: int, seen: Seen) -> list[Question]:
+    """How far a unit moves under the actions that ever moved it so far, whatever its present value, met or not."""
+    far, asked = (seen.then - seen.now) % cardinality, []
+    for move in np.unique(far[far > 0]):
+        leading = np.unique(seen.actions[far == move])
+        rows = np.flatnonzero(np.isin(seen.actions, leading))
+        every = (leading[:, None] * cardinality + np.arange(cardinality)).ravel()
+        question = _question(unit, far[rows], int(move), cardinality, seen.select(rows), every)
+        asked.append(replace(question, values=(every % cardinality + move) % cardinality))
+    return asked
+
+
+def _question(unit: int, came: Ints, value: int, cardinality: int, seen: Seen, every: Ints | None = None) -> Question:
+    """Whether ``came`` [R] is some value; in the contexts met, or in ``every`` one of these."""
+    n, e = np.bincount(seen.pattern), np.bincount(seen.pattern, weights=came == value).astype(np.int64)
     pair_of = np.empty(len(n), dtype=np.int64)
-    pair_of[seen.pattern] = pair
+    pair_of[seen.pattern] = seen.actions * cardinality + seen.now
     rows = np.flatnonzero(n)
-    pairs, context = np.unique(pair_of[rows], return_inverse=True)
-    head = Head(rows, n[rows], came[rows], context.astype(np.int64), pairs // cardinality, pairs % cardinality)
-    return Question(unit, value, pairs, head)
+    pairs = np.unique(pair_of[rows]) if every is None else every
+    context = np.searchsorted(pairs, pair_of[rows]).astype(np.int64)
+    head = Head(rows, n[rows], e[rows], context, pairs // cardinality, pairs % cardinality)
+    return Question(unit, np.full(len(pairs), value), pairs, head)
 
 
 def distinct(table: NDArray[np.generic]) -> tuple[Ints, Ints]:
