@@ -56,8 +56,9 @@ class ModelLearningAgent(SavableAlgorithm):
             FactoredSpace).
         learning_rate: largest rate of the fit's one-cycle schedule; a function of progress is evaluated at its start.
         reward: the goal, see RewardFn; None for the environment's own.
-        model: "auto" (structure from the space), "paper" (section 3's networks), "graphs" (decision graphs found from
-            data), "tabular", "direct" (see ``forecasts``), another registered name, or a TransitionModel.
+        model: "auto" (at present "graphs": decision graphs found from data), "networks" (predictor and conditioner trained
+            by gradient), "paper" (section 3's networks), "tabular", "direct" (see ``forecasts``), another registered name,
+            or a TransitionModel.
         exploration: "auto" or "random".
         gamma: discount of a step when planning.
         num_simulations: simulations for each decision.

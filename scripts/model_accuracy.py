@@ -35,7 +35,7 @@ class Args:
     """5 seeds, up to 20,000 steps, 100,000 tests."""
     cases: tuple[str, ...] = tuple(case.name for case in CASES)
     """Which worlds."""
-    models: tuple[str, ...] = ("auto", "graphs")
+    models: tuple[str, ...] = ("graphs", "networks")
     """Which models."""
     steps: tuple[int, ...] | None = None
     """Steps of random play to learn from; by default 2,000 and 5,000, with --full 20,000 too."""

@@ -31,7 +31,7 @@ DIRECT_STEPS = tuple(range(2, 16))
 """Numbers of steps that the model "direct" learns a network of its own for."""
 
 
-def build_auto(space: FactoredSpace, n_actions: int, learning_rate: float) -> BaseTransitionModel:
+def build_networks(space: FactoredSpace, n_actions: int, learning_rate: float) -> BaseTransitionModel:
     """Weights shared over positions where the observation is a stack of planes, else predictor and causal conditioner."""
     planes = space.planes
     if planes is None:
@@ -66,14 +66,14 @@ def build_string(space: FactoredSpace, n_actions: int, learning_rate: float, n_s
 def build_direct(
     space: FactoredSpace, n_actions: int, learning_rate: float, steps: Sequence[int] | None = None
 ) -> DirectForecastModel:
-    """The model of ``build_auto``, and beside it one model for each of several numbers of steps.
+    """The model of ``build_networks``, and beside it one model for each of several numbers of steps.
 
     By default ``DIRECT_STEPS``, as far as strings of so many actions can be numbered.
     """
     if steps is None:
         steps = [n for n in DIRECT_STEPS if n <= longest_string(n_actions)]
     return DirectForecastModel(
-        build_auto(space, n_actions, learning_rate),
+        build_networks(space, n_actions, learning_rate),
         lambda n_steps: build_string(space, n_actions, learning_rate, n_steps),
         tuple(steps),
     )
@@ -104,11 +104,12 @@ def build_graphs(space: FactoredSpace, n_actions: int, learning_rate: float) -> 
 
 
 _FACTORIES: dict[str, ModelFactory] = {
-    "auto": build_auto,
+    "auto": build_graphs,
+    "graphs": build_graphs,
+    "networks": build_networks,
     "paper": build_paper,
     "tabular": build_tabular,
     "direct": build_direct,
-    "graphs": build_graphs,
 }
 
 

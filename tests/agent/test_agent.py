@@ -190,7 +190,7 @@ def test_the_log_holds_what_the_documentation_names(runner: ModelLearningAgent) 
     agent.learn(300)
     expected = {
         "train/predictor_loss",
-        "train/conditioner_loss",
+        "train/exact_match",
         "rollout/ep_rew_mean",
         "time/fps",
         "model/transitions",

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 
 from mbagent import ModelLearningAgent, persistence
-from mbagent.models.factory import build_auto, register_model
+from mbagent.models.factory import build_graphs, register_model
 from tests.worlds import Corridor, TableWorld, random_table
 
 GEYSER = "mbagent/GeyserRunner-v0"
@@ -134,7 +134,7 @@ def test_custom_models_are_saved_only_when_registered(tmp_path: Path) -> None:
     agent = ModelLearningAgent("MctsPolicy", Corridor(), model=world)
     with pytest.raises(ValueError, match="register_model"):
         agent.save(tmp_path / "a.zip")
-    register_model("my-model", build_auto)
+    register_model("my-model", build_graphs)
     named = ModelLearningAgent("MctsPolicy", Corridor(), model="my-model", seed=0)
     named.save(tmp_path / "b.zip")
     assert ModelLearningAgent.load(tmp_path / "b.zip").model_name == "my-model"

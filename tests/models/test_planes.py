@@ -4,7 +4,7 @@ import torch
 from gymnasium import spaces
 
 from mbagent.models import FactorCodec, NeuralConfig, NeuralTransitionModel, TrainingConfig
-from mbagent.models.factory import build_auto
+from mbagent.models.factory import build_networks
 from mbagent.models.plane_kernels import pack_planes, plane_logits
 from mbagent.models.planes import PlanePredictor
 from mbagent.spaces import FactoredSpace
@@ -45,7 +45,7 @@ def test_the_compiled_network_is_the_trained_one(name: str) -> None:
 
 def test_a_row_does_not_depend_on_the_rows_beside_it() -> None:
     space = FactoredSpace(SPACES["bits"])
-    model = build_auto(space, 3, 0.01)
+    model = build_networks(space, 3, 0.01)
     states, actions = states_of(space, 19), np.arange(19) % 3
     keys = derive(np.arange(19), 5)
     together = model.marginals(states, actions), *model.sample(states, actions, keys)

@@ -78,7 +78,7 @@ class Settings:
     """
 
     cases: tuple[str, ...] = tuple(case.name for case in CASES)
-    models: tuple[str, ...] = ("auto", "graphs")
+    models: tuple[str, ...] = ("graphs", "networks")
     steps: tuple[int, ...] = (2000, 5000, 20_000)
     seeds: int = 5
     first_seed: int = 1000

@@ -19,6 +19,17 @@ def to_arrays(graphs: Graphs) -> dict[str, NDArray[Any]]:
     return {name: array.copy() for name, array in graphs._asdict().items()}
 
 
+def table_of(array: NDArray[Any], width: int) -> NDArray[np.int64]:
+    """Whole numbers, int64 [n, width].
+
+    Raises:
+        ValueError: the array has another width.
+    """
+    if np.ndim(array) != 2 or np.shape(array)[1] != width:
+        raise ValueError(f"These weights do not fit: a table of {width} columns has the shape {np.shape(array)}.")
+    return np.ascontiguousarray(array, dtype=np.int64)
+
+
 def from_arrays(arrays: Mapping[str, NDArray[Any]], layout: Layout, n_columns: int) -> Graphs:
     """The graphs that ``to_arrays`` took apart.
 
@@ -37,7 +48,9 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]], layout: Layout, n_columns: i
     flat: dict[str, Any] = {name: np.ascontiguousarray(array, dtype=kinds[name]).reshape(-1) for name, array in arrays.items()}
     graphs = Graphs(**flat)
     if not _sound(graphs, layout, n_columns):
-        raise ValueError("These weights are no decision graphs of these units; load them into a model of the same environment.")
+        raise ValueError(
+            "These weights do not fit: they are no decision graphs of these units; load them into a model of the same environment."
+        )
     return graphs
 
 

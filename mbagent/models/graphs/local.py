@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.base import FitReport, Floats
-from mbagent.models.graphs.arrays import from_arrays, to_arrays
+from mbagent.models.graphs.arrays import from_arrays, table_of, to_arrays
 from mbagent.models.graphs.channels import PlaneTable, channel_layout, find_couplings, learn_channels, learn_late
 from mbagent.models.graphs.compiled import Graphs, build, habit_of
 from mbagent.models.graphs.evidence import Ints
@@ -184,7 +184,7 @@ class LocalGraphModel(DecisionGraphModel):
         )
         if not _sound(graphs, late, columns):
             raise ValueError("These weights ask for a next state that is not known yet; load them as they were saved.")
-        couplings = tuple(Coupling(int(c), int(k), int(i), bool(e)) for c, k, i, e in np.reshape(state["couplings"], (-1, 4)))
+        couplings = tuple(Coupling(int(c), int(k), int(i), bool(e)) for c, k, i, e in table_of(state["couplings"], 4))
         longest = max(self.board.height, self.board.width)
         if any(c.channel not in range(len(cards)) or c.kind not in (0, 1, 2) or abs(c.line) >= longest for c in couplings):
             raise ValueError("These weights couple cells that these planes do not have; load them into a model of the same kind.")

@@ -23,7 +23,7 @@ from mbagent.models.base import (
     as_keys,
 )
 from mbagent.models.graphs import draws
-from mbagent.models.graphs.arrays import from_arrays, to_arrays
+from mbagent.models.graphs.arrays import from_arrays, table_of, to_arrays
 from mbagent.models.graphs.compiled import Graphs, build, habit_of, n_columns
 from mbagent.models.graphs.events import flag_events
 from mbagent.models.graphs.fitting import Fitted, fit_graphs, nothing_late
@@ -271,7 +271,7 @@ class DecisionGraphModel(BaseTransitionModel):
         wrong = sorted(known ^ set(state))
         if wrong:
             raise ValueError(f"These weights are not those of a decision graph model (first difference: {wrong[0]!r}).")
-        pairs = np.asarray(state["groups"], dtype=np.int64).reshape(-1, 2)
+        pairs = table_of(state["groups"], 2)
         groups = [tuple(int(f) for f in pairs[pairs[:, 0] == unit, 1]) for unit in np.unique(pairs[:, 0])]
         members = pairs[:, 1]
         bits = np.flatnonzero(np.asarray(self.cardinalities) == 2)
