@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -296,6 +297,8 @@ class ModelLearningAgent(SavableAlgorithm):
             report = self.model.fit(self.transitions, seed=self._planning_seed, progress=progress)
         self._n_updates += 1
         self.fit_report = report
+        if report.advice is not None:
+            warnings.warn(report.advice, UserWarning, stacklevel=3)
         starts = np.concatenate([self.policy.start_states, recorder.starts()])
         self.policy.start_states = distinct_rows(starts)[:MAX_START_STATES]
         self.policy.fitted = True

@@ -47,6 +47,8 @@ def log_fit(logger: Logger, report: FitReport, n_updates: int, n_transitions: in
         "predictor_loss": report.predictor_loss,
         "conditioner_loss": report.conditioner_loss,
         "exact_match": report.exact_match,
+        "calibration": report.calibration,
+        "memory": report.memory,
         "epochs": report.epochs,
         "fit_seconds": report.seconds,
     }

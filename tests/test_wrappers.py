@@ -93,7 +93,9 @@ def test_a_model_that_sees_one_step_more_knows_what_comes() -> None:
     def report(env: gym.Env[Any, Any]) -> FitReport | None:
         return ModelLearningAgent("MctsPolicy", env, model="graphs", reward=goal, seed=0).learn(1500).fit_report
 
-    blind, seeing = report(Echo()), report(History(Echo(), 1))
+    with pytest.warns(UserWarning, match="History"):
+        blind = report(Echo())
+    seeing = report(History(Echo(), 1))
     assert blind is not None
     assert blind.exact_match is not None
     assert seeing is not None

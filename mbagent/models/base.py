@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent.models.fit_report import FitReport as FitReport
 from mbagent.transitions import TransitionDataset
 from mbagent_envs.random_keys import derive
 
@@ -32,31 +33,6 @@ Randomness: TypeAlias = np.random.Generator | Keys
 
 LARGEST_NUMBER = 2**62
 """Actions, and strings of actions that are one action of a model, are numbered up to here."""
-
-
-@dataclass(frozen=True)
-class FitReport:
-    """What a fit did.
-
-    Attributes:
-        n_train: rows fitted to.
-        n_validation: rows held out, by whole episodes.
-        epochs: passes over the data before early stopping.
-        seconds: wall time.
-        predictor_loss: held-out cross-entropy of the predictor, nats a transition (None: the model has no predictor).
-        conditioner_loss: the same of the conditioner given the true other variables (None: none).
-        exact_match: share of held-out transitions whose most likely next state is the one met.
-        log: further figures, for the logger.
-    """
-
-    n_train: int
-    n_validation: int
-    epochs: int
-    seconds: float
-    predictor_loss: float | None = None
-    conditioner_loss: float | None = None
-    exact_match: float | None = None
-    log: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

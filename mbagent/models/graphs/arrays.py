@@ -49,7 +49,7 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]], layout: Layout, n_columns: i
     graphs = Graphs(**flat)
     if not _sound(graphs, layout, n_columns):
         raise ValueError(
-            "These weights do not fit: they are no decision graphs of these units; load them into a model of the same environment."
+            "These weights do not fit: they are no graphs of these units; load them into a model of the same environment."
         )
     return graphs
 

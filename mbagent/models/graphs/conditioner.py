@@ -96,11 +96,14 @@ def _dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, owner: Int
     spread = probs * (1.0 - probs)
     uncertain = np.flatnonzero(spread.sum(axis=0) > UNCERTAIN)
     error = shown(layout, rows.next_states, uncertain) - probs[:, uncertain]
-    variance = spread[:, uncertain].T @ spread[:, uncertain]
+    telling = np.zeros((len(uncertain), len(uncertain)), dtype=np.bool_)
+    for action in np.unique(rows.actions):  # what goes together under one action may go apart under another
+        e, v = error[rows.actions == action], spread[rows.actions == action][:, uncertain]
+        telling |= _telling(e.T @ e, v.T @ v, len(uncertain))
     unit, coupling = owner[uncertain], layout.coupling_of[owner[uncertain]]
     earlier = unit[:, None] < unit
     together = (coupling[:, None] == coupling) & (coupling >= 0)
-    goes = earlier & ~together & (coupling < 0) & _telling(error.T @ error, variance, len(uncertain))
+    goes = earlier & ~together & (coupling < 0) & telling
     return {
         int(u): uncertain[goes[:, unit == u].any(axis=1)] for u in np.unique(unit[goes.any(axis=0)]) if goes[:, unit == u].any()
     }

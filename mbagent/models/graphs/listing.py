@@ -6,7 +6,9 @@ Shapes: B rows, F factors, U units (the last two are ``terminated`` and the even
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from mbagent.models.base import Successors
 from mbagent.models.graphs.compiled import Graphs, Ints, distributions, show, show_next, show_next_meetings, write
 from mbagent.models.graphs.couplings import couple, settle
 from mbagent.models.graphs.draws import Work, alone, is_late, settled, work_space
@@ -146,3 +148,19 @@ def _put(state: Ints, number: int, value: int, layout: Layout, ended: bool) -> b
     else:
         write(state, number, value, layout)
     return ended
+
+
+def mixed(usual: Successors, event: Successors, happens: NDArray[np.int64], rates: NDArray[np.float64]) -> Successors:
+    """Both kinds of successors; row ``happens[j]`` of ``usual`` is row j of ``event``, which has the share ``rates`` of it."""
+    rows = np.concatenate([usual.rows, happens[event.rows]])
+    share = rates.copy()
+    share[np.setdiff1d(np.arange(len(rates)), happens)] = 0.0
+    weights = np.concatenate([usual.probabilities * (1.0 - share)[usual.rows], event.probabilities * share[happens[event.rows]]])
+    kept = weights > 0.0
+    order = np.argsort(rows[kept], kind="stable")
+    index = np.flatnonzero(kept)[order]
+    states = np.concatenate([usual.states, event.states])[index]
+    terminated = np.concatenate([usual.terminated, event.terminated])[index]
+    counts = np.bincount(rows[index], minlength=len(rates))
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return Successors(offsets, states, terminated, weights[index])

@@ -11,27 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.base import FitReport, Floats
+from mbagent.models.fit_report import Variable
 from mbagent.models.graphs.arrays import from_arrays, table_of, to_arrays
 from mbagent.models.graphs.channels import PlaneTable, channel_layout, find_couplings, learn_channels, learn_late
 from mbagent.models.graphs.compiled import Graphs, build, habit_of
 from mbagent.models.graphs.evidence import Ints
 from mbagent.models.graphs.fitting import Fitted, nothing_late
 from mbagent.models.graphs.instantiate import Coupling, LocalGraphs, instantiate, with_couplings
-from mbagent.models.graphs.model import IMPOSSIBLE, DecisionGraphModel
+from mbagent.models.graphs.model import FORETOLD, IMPOSSIBLE, DecisionGraphModel
+from mbagent.models.graphs.parents import asked_columns
 from mbagent.models.graphs.search import Search
 from mbagent.models.graphs.units import Question
-from mbagent.models.graphs.windows import NEXT, NEXT_MEETING, Reach, relative_columns
-from mbagent.spaces import FactoredSpace
+from mbagent.models.graphs.windows import NEXT, NEXT_MEETING, Reach, named_column, relative_columns
+from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, first_rows
+from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.transitions import TransitionBatch, TransitionDataset
 
 LARGEST_RADIUS = 3
 """Neighbourhoods are tried up to this radius."""
-
-SOME_ROWS, SOME_TESTS = 3000, 1000
-"""Transitions learned from and held out to choose the reach."""
-
-FORETOLD = -1e-3
-"""Mean log-probability from which on nothing is left to find."""
 
 
 class LocalGraphModel(DecisionGraphModel):
@@ -81,35 +78,62 @@ class LocalGraphModel(DecisionGraphModel):
         likelihood, jointly = self._jointly(held_out)
         if progress is not None:
             progress(0.5)
-        exact = self._exact_match(held_out)
+        exact, (variables, calibration) = self._exact_match(held_out), self._described(held_out)
         rows = data.rows()
         self._learn(rows, jointly)
         if progress is not None:
             progress(1.0)
         figures = {"nodes": float(len(self.local.graphs.column)), "couplings": float(len(self.local.couplings))}
-        return self._report(began, (len(rows), len(held_out)), likelihood, exact, figures)
+        report = self._report((len(rows), len(held_out)), likelihood, exact, figures)
+        memory = self._memory(train, held_out)
+        report = replace(report, variables=variables, calibration=calibration, memory=memory)
+        return replace(report, seconds=time.perf_counter() - began)
+
+    def _variables(self) -> list[Variable]:
+        """Channels; their parents are relative columns."""
+        channels = [int(c) for c in self.local.graphs.changing if c < len(self.local.cardinalities)]
+        found = []
+        for channel in channels:
+            factors = tuple(int(f) for f in self.fitted.layout.cells[channel].ravel())
+            columns = asked_columns(self.local.graphs, channel) | asked_columns(self.local.late, channel)
+            names = dict.fromkeys(named_column(self.local.columns[d]) for d in sorted(columns))
+            found.append(Variable(f"channel {channel}", factors, tuple(names)))
+        return found
+
+    def _planes(self) -> PlaneLayout | None:
+        return self.board
+
+    def _with_memory(self, space: FactoredSpace) -> DecisionGraphModel:
+        return LocalGraphModel(space, self.n_actions, self.reach)
+
+    def _foretold(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
+        """See DecisionGraphModel."""
+        before = self.local, self.fitted
+        self._learn(train, jointly=False)
+        logs = self.log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
+        self.local, self.fitted = before
+        return np.maximum(logs, IMPOSSIBLE)
 
     def _best_reach(self, train: TransitionBatch, held_out: TransitionBatch) -> Reach:
         """The least reach under which held-out transitions are foretold no worse than under larger ones; from some rows."""
         if len(held_out) == 0:
             return Reach()
-        some, tests = (rows.select(np.arange(min(len(rows), n))) for rows, n in ((train, SOME_ROWS), (held_out, SOME_TESTS)))
-        best, logs = Reach(), self._foretold(Reach(), some, tests)
-        while best.radius < LARGEST_RADIUS and logs.mean() < FORETOLD:
-            further = self._foretold(Reach(best.radius + 1), some, tests)
-            if not _better(further, logs):
+        some, tests = first_rows(train, SOME_ROWS), first_rows(held_out, SOME_TESTS)
+        best, logs = Reach(), self._reaching(Reach(), some, tests)
+        most = min(LARGEST_RADIUS, max(self.board.height, self.board.width) // 2)
+        while best.radius < most and logs.mean() < FORETOLD:
+            further = self._reaching(Reach(best.radius + 1), some, tests)
+            if not better(further, logs):
                 break
             best, logs = Reach(best.radius + 1), further
-        if logs.mean() < FORETOLD and _better(self._foretold(best._replace(wrap=True), some, tests), logs):
+        if logs.mean() < FORETOLD and better(self._reaching(best._replace(wrap=True), some, tests), logs):
             best = best._replace(wrap=True)
         return best
 
-    def _foretold(self, reach: Reach, train: TransitionBatch, tests: TransitionBatch) -> Floats:
+    def _reaching(self, reach: Reach, train: TransitionBatch, tests: TransitionBatch) -> Floats:
         """Log-probabilities of transitions after learning from others."""
         self._forget(self.local.cardinalities, reach)
-        self._learn(train, jointly=False)
-        logs = self.log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
-        return np.maximum(logs, IMPOSSIBLE)
+        return self._foretold(train, tests)
 
     def _learn(self, rows: TransitionBatch, jointly: bool = True) -> None:
         """Graphs first, each cell for itself; then what is never on together, and what hangs on what others become."""
@@ -205,9 +229,3 @@ def _sound(graphs: Graphs, late: Graphs, columns: Ints) -> bool:
     asked = graphs.column[graphs.column >= 0]
     channels = columns[columns[:, 0] == NEXT, 1]
     return bool(not np.isin(columns[asked, 0], (NEXT, NEXT_MEETING)).any() and (late.changing <= channels.max() + 1).all())
-
-
-def _better(logs: Floats, others: Floats) -> bool:
-    """Whether log-probabilities are higher than others, of the same transitions, by more than chance."""
-    gain = logs - others
-    return bool(len(gain) > 1 and gain.mean() > 3.0 * gain.std(ddof=1) / np.sqrt(len(gain)))

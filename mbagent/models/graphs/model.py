@@ -22,14 +22,18 @@ from mbagent.models.base import (
     Successors,
     as_keys,
 )
+from mbagent.models.fit_report import Variable, VariableReport, describe
 from mbagent.models.graphs import draws
 from mbagent.models.graphs.arrays import from_arrays, table_of, to_arrays
 from mbagent.models.graphs.compiled import Graphs, build, habit_of, n_columns
 from mbagent.models.graphs.events import flag_events
 from mbagent.models.graphs.fitting import Fitted, fit_graphs, nothing_late
-from mbagent.models.graphs.listing import successors
+from mbagent.models.graphs.listing import mixed, successors
+from mbagent.models.graphs.parents import flat_variables
 from mbagent.models.graphs.units import coupled_layout, is_lone_bit, lay_out
+from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, first_rows, following_steps, with_past
 from mbagent.models.particles import assemble, rows_at_once, start
+from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.transitions import TransitionBatch, TransitionDataset
 from mbagent_envs.random_keys import derive, uniforms
 
@@ -41,6 +45,15 @@ ENOUGH, MOST_SPLITS = 5, 10
 
 MOST_COUNTS = 20_000_000
 """Contexts times columns of a question about how far a factor moves."""
+
+DESCRIBED = 2000
+"""Held-out transitions that figures of single variables are made from."""
+
+WORTH = 0.03
+"""What the past tells is worth telling beyond this share of what cannot be foretold, plus one nat."""
+
+FORETOLD = -1e-3
+"""Mean log-probability from which on nothing is left to find."""
 
 _EVENT = 1 << 33
 """Salt of the random number that decides whether the event happens."""
@@ -81,12 +94,53 @@ class DecisionGraphModel(BaseTransitionModel):
         likelihood, jointly = self._jointly(held_out)
         if progress is not None:
             progress(0.7)
-        exact = self._exact_match(held_out)
+        exact, (variables, calibration) = self._exact_match(held_out), self._described(held_out)
         self.fitted = fit_graphs(self.cardinalities, self.n_actions, rows, events, jointly=jointly, moving=moving)
         if progress is not None:
             progress(1.0)
         figures = {"nodes": float(len(self.fitted.usual.column)), "events": float(events.sum())}
-        return self._report(began, (len(rows), len(held_out)), likelihood, exact, figures)
+        report = self._report((len(rows), len(held_out)), likelihood, exact, figures)
+        memory = self._memory(train, held_out)
+        report = replace(report, variables=variables, calibration=calibration, memory=memory)
+        return replace(report, seconds=time.perf_counter() - began)
+
+    def _described(self, held_out: TransitionBatch) -> tuple[tuple[VariableReport, ...], float | None]:
+        """Figures of each variable on some held-out transitions."""
+        some = first_rows(held_out, DESCRIBED)
+        return describe(self.cardinalities, self.marginals(some.states, some.actions), some, self._variables())
+
+    def _variables(self) -> list[Variable]:
+        """What is reported of."""
+        return flat_variables(self.fitted.layout, self.fitted.usual, self.fitted.late)
+
+    def _memory(self, train: TransitionBatch, held_out: TransitionBatch) -> float:
+        """What the step before tells beyond the present, nats a transition; see FitReport."""
+        some, tests = first_rows(train, SOME_ROWS), first_rows(held_out, SOME_TESTS)
+        later, known = tests.select(following_steps(tests)[0]), some.select(following_steps(some)[0])
+        if min(len(later), len(known)) < 2:
+            return 0.0
+        logs = self._foretold(known, later)
+        if logs.mean() > FORETOLD:
+            return 0.0
+        space, longer = with_past(some, self.cardinalities, self.n_actions, self._planes())
+        _, longer_tests = with_past(tests, self.cardinalities, self.n_actions, self._planes())
+        further = self._with_memory(space)._foretold(longer, longer_tests)
+        gain = float((further - logs).mean())
+        return gain if better(further, logs) and gain > WORTH * (1.0 - logs.mean()) else 0.0
+
+    def _planes(self) -> PlaneLayout | None:
+        return None
+
+    def _with_memory(self, space: FactoredSpace) -> DecisionGraphModel:
+        return DecisionGraphModel(space.cardinalities, self.n_actions)
+
+    def _foretold(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
+        """Log-probabilities of transitions after a quick look at others; what was learned stays as it is."""
+        before, events = self.fitted, flag_events(train.states, train.next_states) & self.fitted.has_event
+        self.fitted = fit_graphs(self.cardinalities, self.n_actions, train, events, False, False)
+        logs = self.log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
+        self.fitted = before
+        return np.maximum(logs, IMPOSSIBLE)
 
     def _jointly(self, held_out: TransitionBatch) -> tuple[float, bool]:
         """Held-out likelihood, and whether it is better for drawing some units late."""
@@ -96,16 +150,14 @@ class DecisionGraphModel(BaseTransitionModel):
         apart = self._likelihood(replace(self.fitted, late=nothing_late(self.fitted.usual)), held_out)
         return max(likelihood, apart), likelihood > apart
 
-    def _report(
-        self, began: float, sizes: tuple[int, int], likelihood: float, exact: float, figures: Mapping[str, float]
-    ) -> FitReport:
+    def _report(self, sizes: tuple[int, int], likelihood: float, exact: float, figures: Mapping[str, float]) -> FitReport:
         """What a fit did; ``sizes`` are the rows fitted to and held out."""
         splits = [sum(split.column >= 0 for split in search.splits) for search in self.fitted.found]
         return FitReport(
             n_train=sizes[0],
             n_validation=sizes[1],
             epochs=1,
-            seconds=time.perf_counter() - began,
+            seconds=0.0,
             predictor_loss=-likelihood,
             exact_match=exact,
             log={"questions": float(len(splits)), "splits": float(np.mean(splits)) if splits else 0.0, **figures},
@@ -293,19 +345,3 @@ class DecisionGraphModel(BaseTransitionModel):
             for name, n in (("usual", now), ("late", both), ("event", now))
         )
         self.fitted = Fitted(layout, usual, late, event, bool(state["has_event"]), (), ())
-
-
-def mixed(usual: Successors, event: Successors, happens: NDArray[np.int64], rates: Floats) -> Successors:
-    """Both kinds of successors; row ``happens[j]`` of ``usual`` is row j of ``event``, which has the share ``rates`` of it."""
-    rows = np.concatenate([usual.rows, happens[event.rows]])
-    share = rates.copy()
-    share[np.setdiff1d(np.arange(len(rates)), happens)] = 0.0
-    weights = np.concatenate([usual.probabilities * (1.0 - share)[usual.rows], event.probabilities * share[happens[event.rows]]])
-    kept = weights > 0.0
-    order = np.argsort(rows[kept], kind="stable")
-    index = np.flatnonzero(kept)[order]
-    states = np.concatenate([usual.states, event.states])[index]
-    terminated = np.concatenate([usual.terminated, event.terminated])[index]
-    counts = np.bincount(rows[index], minlength=len(rates))
-    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    return Successors(offsets, states, terminated, weights[index])

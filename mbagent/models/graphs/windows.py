@@ -189,3 +189,19 @@ def column_kinds(columns: Ints) -> Ints:
     of_channel = np.isin(kind, (CELL, NEXT, WRAP))
     kinds = np.where(of_channel, columns[:, 1] + n_channels * (kind == NEXT), 2 * n_channels + kind)
     return kinds.astype(np.int64)
+
+
+def named_column(column: Ints) -> str:
+    """A relative column in words."""
+    kind, *parts = (int(part) for part in column)
+    if kind == ACTION:
+        return f"action {parts[0]}"
+    if kind == BORDER:
+        return f"border at ({parts[0]:+d}, {parts[1]:+d})"
+    if kind in (MEETING, NEXT_MEETING):
+        other = "the border" if parts[2] == BEYOND else f"channel {parts[2]} = {parts[3]}"
+        words = f"channel {parts[0]} = {parts[1]} anywhere with {other} at ({parts[4]:+d}, {parts[5]:+d})"
+    else:
+        words = f"channel {parts[0]} = {parts[1]} at ({parts[2]:+d}, {parts[3]:+d})"
+        words += " around the board" if kind == WRAP else ""
+    return f"next {words}" if kind in (NEXT, NEXT_MEETING) else words

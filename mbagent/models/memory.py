@@ -1,0 +1,69 @@
+"""Whether the next state hangs on more than the present one and the action: does the step before tell anything more?
+
+If it does, the observation is not the whole state, and ``mbagent.wrappers.History`` makes the past part of it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mbagent.spaces import FactoredSpace, PlaneLayout
+from mbagent.transitions import TransitionBatch
+
+SOME_ROWS, SOME_TESTS = 2500, 1000
+"""Transitions learned from and held out to look at a question such as this one."""
+
+
+def better(logs: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
+    """Whether log-probabilities [N] are higher than others, of the same transitions, by more than chance."""
+    gain = logs - others
+    return bool(len(gain) > 1 and gain.mean() > 3.0 * gain.std(ddof=1) / np.sqrt(len(gain)))
+
+
+def first_rows(rows: TransitionBatch, most: int) -> TransitionBatch:
+    """The first transitions, in their order."""
+    return rows.select(np.arange(min(len(rows), most)))
+
+
+def following_steps(rows: TransitionBatch) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Numbers of the transitions that follow another in the same episode, and of those; episodes may be interleaved."""
+    order = np.argsort(rows.episodes, kind="stable")
+    earlier, later = order[:-1], order[1:]
+    same = (rows.episodes[later] == rows.episodes[earlier]) & (rows.states[later] == rows.next_states[earlier]).all(axis=1)
+    return later[same], earlier[same]
+
+
+def with_past(
+    rows: TransitionBatch, cardinalities: tuple[int, ...], n_actions: int, board: PlaneLayout | None
+) -> tuple[FactoredSpace, TransitionBatch]:
+    """The transitions that follow another, with that one's state and action as part of their state.
+
+    Args:
+        rows: transitions, consecutive steps together.
+        cardinalities: number of values of each factor.
+        n_actions: number of actions A.
+        board: where the factors are cells of planes; the past is further planes then.
+
+    Returns:
+        (the space of states with a past, the transitions).
+    """
+    now, before = (rows.select(which) for which in following_steps(rows))
+    shape: tuple[int, ...] = (len(cardinalities),) if board is None else (board.channels, board.height, board.width)
+
+    def laid_out(states: NDArray[np.int64]) -> NDArray[np.int64]:
+        return states if board is None else board.to_planes(states)
+
+    def shown(states: NDArray[np.int64], past: NDArray[np.int64], actions: NDArray[np.int64]) -> NDArray[np.int64]:
+        bits = (actions[:, None] == np.arange(n_actions)).astype(np.int64)
+        bits = bits if board is None else np.broadcast_to(bits[:, :, None, None], (*bits.shape, *shape[1:]))
+        return np.concatenate([laid_out(states), laid_out(past), bits], axis=1)
+
+    cards = laid_out(np.asarray(cardinalities)[None])[0]
+    twos = np.full((n_actions, *shape[1:]), 2)
+    sizes = np.concatenate([cards, cards, twos])
+    space = FactoredSpace(spaces.MultiBinary(sizes.shape) if (sizes == 2).all() else spaces.MultiDiscrete(sizes))
+    states = space.encode(shown(now.states, before.states, before.actions))
+    following = space.encode(shown(now.next_states, now.states, now.actions))
+    return space, TransitionBatch(states, now.actions, following, now.terminated, now.rewards, now.episodes)
