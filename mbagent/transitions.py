@@ -124,13 +124,21 @@ class TransitionDataset:
         rows = self.rows()
         if fraction == 0.0 or len(rows) < 10:
             return rows, rows
+        held_out = self.held_out(fraction, seed, min_episodes)
+        return rows.select(~held_out), rows.select(held_out)
+
+    def held_out(self, fraction: float, seed: int, min_episodes: int = 10) -> NDArray[np.bool_]:
+        """Which rows ``split`` holds out, bool [N]."""
+        rows = self.rows()
+        if fraction == 0.0 or len(rows) < 10:
+            return np.zeros(len(rows), dtype=np.bool_)
         _, groups = np.unique(rows.episodes, return_inverse=True)
         if groups.max() + 1 < min_episodes:
             groups = np.arange(len(rows)) * min_episodes // len(rows)
         n_groups = int(groups.max()) + 1
         order = np.random.default_rng(seed).permutation(n_groups)
-        held_out = np.isin(groups, order[: max(1, round(fraction * n_groups))])
-        return rows.select(~held_out), rows.select(held_out)
+        result: NDArray[np.bool_] = np.isin(groups, order[: max(1, round(fraction * n_groups))])
+        return result
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the table as a compressed ``.npz`` (plain arrays: any language reads it, nothing is pickled)."""

@@ -68,14 +68,22 @@ class PlaneTable:
         cardinalities: number of values of each channel's cells, length C.
         columns: all relative columns, int64 [D, 7].
         n_actions: number of actions A.
+        since: first row that counts for each channel and for ``terminated``, int64 [C + 1]; None for all.
     """
 
     def __init__(
-        self, rows: TransitionBatch, board: PlaneLayout, cardinalities: tuple[int, ...], columns: Ints, n_actions: int
+        self,
+        rows: TransitionBatch,
+        board: PlaneLayout,
+        cardinalities: tuple[int, ...],
+        columns: Ints,
+        n_actions: int,
+        since: Ints | None = None,
     ) -> None:
         """See the class."""
         self.board, self.cardinalities, self.columns, self.n_actions = board, cardinalities, columns, n_actions
         self.n_cells = board.height * board.width
+        self.since = np.zeros(len(cardinalities) + 1, dtype=np.int64) if since is None else since
         every = board.to_planes(rows.states), board.to_planes(rows.next_states)
         known = known_columns(columns, *every)
         kind = columns[known, 0]
@@ -109,7 +117,12 @@ class PlaneTable:
 
     def seen(self, channel: int) -> Seen:
         """A channel's values in all cells; looks are rows of ``table``."""
-        return Seen(self.pattern, self.actions, self.before[:, channel].reshape(-1), self.after[:, channel].reshape(-1))
+        every = Seen(self.pattern, self.actions, self.before[:, channel].reshape(-1), self.after[:, channel].reshape(-1))
+        return every.select(self.cells_since(channel))
+
+    def cells_since(self, channel: int) -> Ints:
+        """Numbers of the cells that count for a channel."""
+        return np.arange(min(self.since[channel] * self.n_cells, len(self.actions)), len(self.actions))
 
     def far_values(self, numbers: Ints) -> Bools:
         """Columns that are the same at all positions, bool [N, len(numbers)]."""
@@ -123,10 +136,8 @@ class PlaneTable:
 
     def build(self, asked: Sequence[Question], found: Sequence[Search]) -> Graphs:
         """Graphs of channels, ``terminated`` and the event that never happens."""
-        habits = [
-            habit_of(k, self.n_actions, self.actions, self.before[:, c].reshape(-1), self.after[:, c].reshape(-1))
-            for c, k in enumerate(self.cardinalities)
-        ]
+        seen = [self.seen(channel) for channel in range(len(self.cardinalities))]
+        habits = [habit_of(k, self.n_actions, s.actions, s.now, s.then) for k, s in zip(self.cardinalities, seen, strict=True)]
         nothing, ends = np.zeros(len(self.rows), dtype=np.int64), self.rows.terminated.astype(np.int64)
         habits += [habit_of(2, self.n_actions, self.rows.actions, nothing, then) for then in (ends, nothing)]
         still = 0.5 / (len(self.actions) * len(self.cardinalities) + 1.0)
@@ -150,7 +161,8 @@ def _ends(planes: PlaneTable, numbers: Ints) -> tuple[list[Question], list[Searc
     rows, far = planes.rows, planes.far_values(numbers)
     first, pattern = distinct(np.packbits(far, axis=1))
     nothing, ends = np.zeros(len(rows), dtype=np.int64), rows.terminated.astype(np.int64)
-    asked = ask(len(planes.cardinalities), 2, Seen(pattern, rows.actions, nothing, ends))
+    counting = np.arange(min(planes.since[-1], len(rows)), len(rows))
+    asked = ask(len(planes.cardinalities), 2, Seen(pattern, rows.actions, nothing, ends).select(counting))
     return asked, planes.split(asked, far[first], numbers)
 
 
@@ -166,8 +178,9 @@ def learn_late(planes: PlaneTable, layout: Layout, graphs: Graphs) -> tuple[Grap
     for channel, numbers in _dependent(planes, layout, graphs).items():
         units = layout.cells[channel].ravel()
         needed = draws.uncertain(planes.rows.states, planes.rows.actions, layout, graphs, units)
-        which = np.flatnonzero((needed & (layout.coupling_of[units] < 0)).ravel())
-        some = planes.seen(channel).select(which)
+        counting = planes.cells_since(channel)
+        kept = np.flatnonzero((needed & (layout.coupling_of[units] < 0)).ravel()[counting])
+        some, which = planes.seen(channel).select(kept), counting[kept]
         following = column_values(planes.columns[numbers], planes.before, planes.rows.actions, planes.after)[which]
         first, pattern = distinct(np.concatenate([some.pattern[:, None], following], axis=1))
         questions = ask(channel, planes.cardinalities[channel], replace(some, pattern=pattern))

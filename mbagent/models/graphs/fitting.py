@@ -68,11 +68,17 @@ class _Table:
         rows: N transitions.
         events: which of them are rare events, bool [N].
         moving: factors that are asked how far they move.
+        since: first row that counts for each factor and for ``terminated``, int64 [F + 1]; None for all.
     """
 
-    def __init__(self, layout: Layout, rows: TransitionBatch, events: Bools, moving: Collection[int]) -> None:
+    def __init__(self, layout: Layout, rows: TransitionBatch, events: Bools, moving: Collection[int], since: Ints | None) -> None:
         """See the class."""
         self.layout, self.rows = layout, rows
+        self.since = np.zeros(len(layout.outputs), dtype=np.int64)
+        if since is not None:
+            members = [layout.members[begin:end] for begin, end in zip(layout.first, layout.first[1:], strict=False)]
+            self.since[:-2] = [since[factors].max() for factors in members[:-2]]
+            self.since[-2] = since[-1]
         lone = np.flatnonzero(np.diff(layout.first) == 1)
         self.moving = lone[np.isin(layout.members[layout.first[lone]], list(moving))]
         flags = np.stack([rows.terminated, events], axis=1).astype(np.int64)
@@ -83,7 +89,12 @@ class _Table:
 
     def ask(self, unit: int, which: Ints) -> list[Question]:
         """The questions about a unit, of some rows."""
-        return self.questions(unit, self.seen(unit).select(which))
+        return self.questions(unit, self.seen(unit).select(self.counting(unit, which)))
+
+    def counting(self, unit: int, which: Ints) -> Ints:
+        """Those of some rows that count for a unit."""
+        result: Ints = which[which >= self.since[unit]]
+        return result
 
     def questions(self, unit: int, seen: Seen) -> list[Question]:
         """The questions about a unit, of rows with whatever looks."""
@@ -100,11 +111,11 @@ class _Table:
 
     def build(self, asked: Sequence[Question], found: Sequence[Search], seen: Ints, still: float) -> Graphs:
         """The graphs; habits are those of the rows seen."""
-        actions, now, then = self.rows.actions[seen], self.now[seen], self.then[seen]
-        habits = [
-            habit_of(int(cardinality), self.layout.n_actions, actions, now[:, unit], then[:, unit])
-            for unit, cardinality in enumerate(self.layout.outputs)
-        ]
+        habits = []
+        for unit, cardinality in enumerate(self.layout.outputs):
+            some = self.counting(unit, seen)
+            actions, now, then = self.rows.actions[some], self.now[some, unit], self.then[some, unit]
+            habits.append(habit_of(int(cardinality), self.layout.n_actions, actions, now, then))
         return build(self.layout, asked, found, habits, still)
 
 
@@ -121,6 +132,7 @@ def fit_graphs(
     in_pairs: bool = True,
     jointly: bool = True,
     moving: Collection[int] = (),
+    since: Ints | None = None,
 ) -> Fitted:
     """Fits everything.
 
@@ -132,10 +144,11 @@ def fit_graphs(
         in_pairs: whether to look for causes that matter only together, which takes most of the time.
         jointly: whether to look for units that hang on what others become.
         moving: factors that are asked how far they move, and not where they go.
+        since: first row that counts for each factor and for ``terminated``, int64 [F + 1]; None for all.
     """
     groups = find_groups(cardinalities, rows.states, rows.next_states, ~events)
     layout = lay_out(cardinalities, groups, n_actions)
-    table, usual = _Table(layout, rows, events, moving), np.flatnonzero(~events)
+    table, usual = _Table(layout, rows, events, moving, since), np.flatnonzero(~events)
     last = len(layout.outputs) - 1
     asked_of = {unit: np.arange(len(rows)) if unit == last else usual for unit in range(last + 1)}
     graphs, asked, found = _graphs(table, asked_of, usual, True, in_pairs)
@@ -158,9 +171,10 @@ def _late_graphs(
     rows, kinds, n_columns = table.rows, table.kinds(usual), table.columns.shape[1]
     late, all_asked, all_found = [], [], []
     for unit, columns in find_dependent(layout, graphs, rows, usual):
-        needed = draws.uncertain(rows.states[usual], rows.actions[usual], layout, graphs, np.asarray([unit]))[:, 0]
-        some = table.seen(unit).select(usual[needed])
-        following = shown(layout, rows.next_states[usual[needed]], columns)
+        counting = table.counting(unit, usual)
+        needed = draws.uncertain(rows.states[counting], rows.actions[counting], layout, graphs, np.asarray([unit]))[:, 0]
+        some = table.seen(unit).select(counting[needed])
+        following = shown(layout, rows.next_states[counting[needed]], columns)
         first, pattern = distinct(np.concatenate([some.pattern[:, None], following], axis=1))
         asked = table.questions(unit, replace(some, pattern=pattern))
         more_kinds = np.concatenate([kinds, kinds.max(initial=0) + 1 + kinds[columns]])

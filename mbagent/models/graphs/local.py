@@ -18,8 +18,9 @@ from mbagent.models.graphs.compiled import Graphs, build, habit_of
 from mbagent.models.graphs.evidence import Ints
 from mbagent.models.graphs.fitting import Fitted, nothing_late
 from mbagent.models.graphs.instantiate import Coupling, LocalGraphs, instantiate, with_couplings
-from mbagent.models.graphs.model import FORETOLD, IMPOSSIBLE, DecisionGraphModel
+from mbagent.models.graphs.model import FORETOLD, DecisionGraphModel
 from mbagent.models.graphs.parents import asked_columns
+from mbagent.models.graphs.recency import still_true_since
 from mbagent.models.graphs.search import Search
 from mbagent.models.graphs.units import Question
 from mbagent.models.graphs.windows import NEXT, NEXT_MEETING, Reach, named_column, relative_columns
@@ -72,18 +73,20 @@ class LocalGraphModel(DecisionGraphModel):
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel."""
         began = time.perf_counter()
-        train, held_out = data.split(self.validation, seed)
-        self._forget(self.local.cardinalities, self.given or self._best_reach(train, held_out))
-        self._learn(train)
+        rows = data.rows()
+        self._forget(self.local.cardinalities, self.given or self._best_reach(*data.split(self.validation, seed)))
+        since = self._since(rows)
+        train, held_out, train_since = self._split(data, seed, since)
+        self._learn(train, since=train_since)
         likelihood, jointly = self._jointly(held_out)
         if progress is not None:
             progress(0.5)
         exact, (variables, calibration) = self._exact_match(held_out), self._described(held_out)
-        rows = data.rows()
-        self._learn(rows, jointly)
+        self._learn(rows, jointly, since)
         if progress is not None:
             progress(1.0)
         figures = {"nodes": float(len(self.local.graphs.column)), "couplings": float(len(self.local.couplings))}
+        figures["changed"] = float((since > 0).sum())
         report = self._report((len(rows), len(held_out)), likelihood, exact, figures)
         memory = self._memory(train, held_out)
         report = replace(report, variables=variables, calibration=calibration, memory=memory)
@@ -106,13 +109,25 @@ class LocalGraphModel(DecisionGraphModel):
     def _with_memory(self, space: FactoredSpace) -> DecisionGraphModel:
         return LocalGraphModel(space, self.n_actions, self.reach)
 
-    def _foretold(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
-        """See DecisionGraphModel."""
-        before = self.local, self.fitted
-        self._learn(train, jointly=False)
-        logs = self.log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
-        self.local, self.fitted = before
-        return np.maximum(logs, IMPOSSIBLE)
+    def _since(self, rows: TransitionBatch) -> Ints:
+        """First row that tells of each channel, and of ``terminated``, as it is now."""
+        return still_true_since(rows, len(self.local.cardinalities) + 1, self._channels_foretold)
+
+    def _channels_foretold(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
+        """As for factors, summed over each channel, [T, C + 1]."""
+        each = self._factors_foretold(train, tests)
+        cells = self.board.to_planes(each[:, :-1]).sum(axis=(2, 3))
+        return np.concatenate([cells, each[:, -1:]], axis=1)
+
+    def _look(self, rows: TransitionBatch) -> None:
+        """Learns quickly."""
+        self._learn(rows, jointly=False)
+
+    def _kept(self) -> Any:
+        return self.local, self.fitted, self.reach
+
+    def _restore(self, kept: Any) -> None:
+        self.local, self.fitted, self.reach = kept
 
     def _best_reach(self, train: TransitionBatch, held_out: TransitionBatch) -> Reach:
         """The least reach under which held-out transitions are foretold no worse than under larger ones; from some rows."""
@@ -135,10 +150,10 @@ class LocalGraphModel(DecisionGraphModel):
         self._forget(self.local.cardinalities, reach)
         return self._foretold(train, tests)
 
-    def _learn(self, rows: TransitionBatch, jointly: bool = True) -> None:
+    def _learn(self, rows: TransitionBatch, jointly: bool = True, since: Ints | None = None) -> None:
         """Graphs first, each cell for itself; then what is never on together, and what hangs on what others become."""
         local = self.local
-        planes = PlaneTable(rows, self.board, local.cardinalities, local.columns, self.n_actions)
+        planes = PlaneTable(rows, self.board, local.cardinalities, local.columns, self.n_actions, since)
         graphs, asked, found = learn_channels(planes)
         self.local = replace(local, graphs=graphs, late=nothing_late(graphs), couplings=())
         self._instantiate((), ())

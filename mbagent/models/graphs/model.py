@@ -11,31 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.base import (
-    Actions,
-    BaseTransitionModel,
     Bools,
     FitReport,
     Floats,
-    Keys,
-    Randomness,
-    States,
-    Successors,
-    as_keys,
 )
 from mbagent.models.fit_report import Variable, VariableReport, describe
-from mbagent.models.graphs import draws
 from mbagent.models.graphs.arrays import from_arrays, table_of, to_arrays
 from mbagent.models.graphs.compiled import Graphs, build, habit_of, n_columns
 from mbagent.models.graphs.events import flag_events
 from mbagent.models.graphs.fitting import Fitted, fit_graphs, nothing_late
-from mbagent.models.graphs.listing import mixed, successors
 from mbagent.models.graphs.parents import flat_variables
+from mbagent.models.graphs.predictions import GraphPredictions
+from mbagent.models.graphs.recency import still_true_since
 from mbagent.models.graphs.units import coupled_layout, is_lone_bit, lay_out
 from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, first_rows, following_steps, with_past
-from mbagent.models.particles import assemble, rows_at_once, start
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.transitions import TransitionBatch, TransitionDataset
-from mbagent_envs.random_keys import derive, uniforms
 
 IMPOSSIBLE = -200.0
 """Log-probability that an impossible transition is charged with when models are compared."""
@@ -55,11 +46,8 @@ WORTH = 0.03
 FORETOLD = -1e-3
 """Mean log-probability from which on nothing is left to find."""
 
-_EVENT = 1 << 33
-"""Salt of the random number that decides whether the event happens."""
 
-
-class DecisionGraphModel(BaseTransitionModel):
+class DecisionGraphModel(GraphPredictions):
     """Each variable's next value by a small decision graph over the few columns that it hangs on.
 
     Bits of which exactly one is on are drawn as one variable. Rare events that redraw almost everything have graphs of
@@ -84,25 +72,54 @@ class DecisionGraphModel(BaseTransitionModel):
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel."""
         began = time.perf_counter()
-        train, held_out = data.split(self.validation, seed)
-        rows, events = data.rows(), self._events(data, seed)
+        rows, events, since = data.rows(), self._events(data, seed), self._since(data.rows())
+        train, held_out, train_since = self._split(data, seed, since)
         if progress is not None:
             progress(0.4)
         flagged = flag_events(train.states, train.next_states) & events.any()
         moving = self._moving(train, flagged, held_out)
-        self.fitted = fit_graphs(self.cardinalities, self.n_actions, train, flagged, moving=moving)
+        self.fitted = fit_graphs(self.cardinalities, self.n_actions, train, flagged, moving=moving, since=train_since)
         likelihood, jointly = self._jointly(held_out)
         if progress is not None:
             progress(0.7)
         exact, (variables, calibration) = self._exact_match(held_out), self._described(held_out)
-        self.fitted = fit_graphs(self.cardinalities, self.n_actions, rows, events, jointly=jointly, moving=moving)
+        self.fitted = fit_graphs(self.cardinalities, self.n_actions, rows, events, True, jointly, moving, since)
         if progress is not None:
             progress(1.0)
         figures = {"nodes": float(len(self.fitted.usual.column)), "events": float(events.sum())}
+        figures["changed"] = float((since > 0).sum())
         report = self._report((len(rows), len(held_out)), likelihood, exact, figures)
         memory = self._memory(train, held_out)
         report = replace(report, variables=variables, calibration=calibration, memory=memory)
         return replace(report, seconds=time.perf_counter() - began)
+
+    def _since(self, rows: TransitionBatch) -> NDArray[np.int64]:
+        """First row that tells of each factor, and of ``terminated``, as it is now."""
+        return still_true_since(rows, len(self.cardinalities) + 1, self._factors_foretold)
+
+    def _split(
+        self, data: TransitionDataset, seed: int, since: NDArray[np.int64]
+    ) -> tuple[TransitionBatch, TransitionBatch, NDArray[np.int64]]:
+        """Training and held-out rows, and ``since`` among the former; what came before a change is not held out."""
+        rows, mask = data.rows(), data.held_out(self.validation, seed)
+        if not since.any():
+            return (*data.split(self.validation, seed), since)
+        mask &= np.arange(len(rows)) >= since.max()
+        return rows.select(~mask), rows.select(mask), np.searchsorted(np.flatnonzero(~mask), since)
+
+    def _factors_foretold(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
+        """Log-probability of each factor's next value and of the end, [T, F + 1], after a quick look at other transitions."""
+        before = self._kept()
+        self._look(train)
+        probs, start = self.marginals(tests.states, tests.actions), np.concatenate([[0], np.cumsum(self.cardinalities)])
+        chosen = np.take_along_axis(probs, start[:-1] + tests.next_states, axis=1)
+        ends = [
+            self.log_prob(tests.states, tests.actions, tests.next_states, np.full(len(tests), over)) for over in (False, True)
+        ]
+        ends = [np.maximum(logs, -1e3) for logs in ends]  # an impossible state says nothing of the end
+        over = np.where(tests.terminated, ends[1], ends[0]) - np.logaddexp(*ends)
+        self._restore(before)
+        return np.concatenate([np.log(chosen.clip(1e-9)), over.clip(-20.0)[:, None]], axis=1)
 
     def _described(self, held_out: TransitionBatch) -> tuple[tuple[VariableReport, ...], float | None]:
         """Figures of each variable on some held-out transitions."""
@@ -136,11 +153,22 @@ class DecisionGraphModel(BaseTransitionModel):
 
     def _foretold(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
         """Log-probabilities of transitions after a quick look at others; what was learned stays as it is."""
-        before, events = self.fitted, flag_events(train.states, train.next_states) & self.fitted.has_event
-        self.fitted = fit_graphs(self.cardinalities, self.n_actions, train, events, False, False)
+        before = self._kept()
+        self._look(train)
         logs = self.log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
-        self.fitted = before
+        self._restore(before)
         return np.maximum(logs, IMPOSSIBLE)
+
+    def _look(self, rows: TransitionBatch) -> None:
+        """Learns quickly."""
+        events = flag_events(rows.states, rows.next_states) & self.fitted.has_event
+        self.fitted = fit_graphs(self.cardinalities, self.n_actions, rows, events, False, False)
+
+    def _kept(self) -> Any:
+        return self.fitted
+
+    def _restore(self, kept: Any) -> None:
+        self.fitted = kept
 
     def _jointly(self, held_out: TransitionBatch) -> tuple[float, bool]:
         """Held-out likelihood, and whether it is better for drawing some units late."""
@@ -205,94 +233,6 @@ class DecisionGraphModel(BaseTransitionModel):
         states, terminated = self.likeliest(rows.states, rows.actions)
         hit = (states == rows.next_states).all(axis=1) & (terminated == rows.terminated)
         return float(hit.mean()) if len(hit) else 1.0
-
-    def _rows(self, states: States, actions: Actions) -> tuple[States, Actions]:
-        states, actions = np.ascontiguousarray(states, dtype=np.int64), np.ascontiguousarray(actions, dtype=np.int64)
-        if states.ndim != 2 or states.shape[1] != len(self.cardinalities) or actions.shape != (len(states),):
-            raise ValueError(
-                f"A model of {len(self.cardinalities)} factors needs states [B, {len(self.cardinalities)}] and actions [B], "
-                f"got shapes {states.shape} and {actions.shape}."
-            )
-        return states, actions
-
-    def _event_rates(self, states: States, actions: Actions) -> Floats:
-        if not self.fitted.has_event:
-            return np.zeros(len(states))
-        rates: Floats = draws.event_rates(states, actions, self.fitted.layout, self.fitted.usual)
-        return rates
-
-    def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
-        """See TransitionModel."""
-        states, actions = self._rows(states, actions)
-        return self._draw(states, actions, as_keys(rng, len(states)))
-
-    def _draw(self, states: States, actions: Actions, keys: Keys, greedy: bool = False) -> tuple[States, Bools]:
-        """Draws by keys, or takes the likeliest value of each unit."""
-        fitted, following, over = self.fitted, states.copy(), np.zeros(len(states), dtype=np.bool_)
-        draws.sample(states, actions, keys, greedy, fitted.layout, fitted.usual, fitted.late, following, over)
-        luck = 0.5 if greedy else uniforms(derive(keys, _EVENT), 1)[:, 0]
-        happens = np.flatnonzero(luck < self._event_rates(states, actions))
-        if len(happens):
-            given, event = states[happens], fitted.event
-            redrawn, ends = given.copy(), np.zeros(len(happens), dtype=np.bool_)
-            late = nothing_late(event)
-            draws.sample(given, actions[happens], keys[happens], greedy, fitted.layout, event, late, redrawn, ends)
-            following[happens], over[happens] = redrawn, ends
-        return following, over
-
-    def likeliest(self, states: States, actions: Actions) -> tuple[States, Bools]:
-        """The likeliest next states, unit by unit, int64 [B, F], and whether they end the episode, bool [B]."""
-        states, actions = self._rows(states, actions)
-        return self._draw(states, actions, np.zeros(len(states), dtype=np.uint64), greedy=True)
-
-    def marginals(self, states: States, actions: Actions) -> Floats:
-        """See TransitionModel."""
-        states, actions = self._rows(states, actions)
-        start = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64)
-        fitted, probs = self.fitted, np.empty((len(states), int(start[-1])))
-        draws.marginals(states, actions, fitted.layout, fitted.usual, start, probs)
-        if fitted.has_event:
-            rate, redrawn = self._event_rates(states, actions)[:, None], np.empty_like(probs)
-            draws.marginals(states, actions, fitted.layout, fitted.event, start, redrawn)
-            probs += rate * (redrawn - probs)
-        return probs
-
-    def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
-        """See TransitionModel; exact for the distribution that ``sample`` draws from."""
-        states, actions = self._rows(states, actions)
-        following, over = np.ascontiguousarray(next_states, dtype=np.int64), np.ascontiguousarray(terminated, dtype=np.bool_)
-        layout = self.fitted.layout
-        usual: Floats = draws.log_prob(states, actions, following, over, layout, self.fitted.usual, self.fitted.late)
-        if not self.fitted.has_event:
-            return usual
-        rate = self._event_rates(states, actions)
-        event = draws.log_prob(states, actions, following, over, layout, self.fitted.event, nothing_late(self.fitted.event))
-        with np.errstate(divide="ignore"):
-            return np.logaddexp(np.log1p(-rate) + usual, np.log(rate) + event)
-
-    def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
-        """See TransitionModel; systematic draws, see ``models/systematic.py``."""
-        states, actions = self._rows(states, actions)
-        usual = self._successors(states, actions, self.fitted.usual, self.fitted.late, n_samples, seed)
-        rates = self._event_rates(states, actions)
-        happens = np.flatnonzero(rates >= 1.0 / n_samples)
-        if len(happens) == 0:
-            return usual
-        late = nothing_late(self.fitted.event)
-        event = self._successors(states[happens], actions[happens], self.fitted.event, late, n_samples, seed)
-        return mixed(usual, event, happens, rates)
-
-    def _successors(
-        self, states: States, actions: Actions, graphs: Graphs, late: Graphs, n_samples: int, seed: int
-    ) -> Successors:
-        key, offset = start(seed)
-        layout, n_outputs = self.fitted.layout, states.shape[1] + 1
-        step = rows_at_once(n_samples, n_outputs)
-        parts = [
-            successors(states[b : b + step], actions[b : b + step], layout, graphs, late, n_samples, key, offset)
-            for b in range(0, len(states), step)
-        ]
-        return assemble(parts, n_samples, n_outputs)
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """See TransitionModel."""

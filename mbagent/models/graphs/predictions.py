@@ -1,0 +1,124 @@
+"""What decision graphs foretell: draws, probabilities and successors, all exact."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mbagent.models.base import (
+    Actions,
+    BaseTransitionModel,
+    Bools,
+    Floats,
+    Keys,
+    Randomness,
+    States,
+    Successors,
+    as_keys,
+)
+from mbagent.models.graphs import draws
+from mbagent.models.graphs.compiled import Graphs
+from mbagent.models.graphs.fitting import Fitted, nothing_late
+from mbagent.models.graphs.listing import mixed, successors
+from mbagent.models.particles import assemble, rows_at_once, start
+from mbagent_envs.random_keys import derive, uniforms
+
+_EVENT = 1 << 33
+"""Salt of the random number that decides whether the event happens."""
+
+
+class GraphPredictions(BaseTransitionModel):
+    """The part of a model that reads graphs, however they were found.
+
+    Attributes:
+        fitted: the graphs.
+    """
+
+    fitted: Fitted
+
+    def _rows(self, states: States, actions: Actions) -> tuple[States, Actions]:
+        states, actions = np.ascontiguousarray(states, dtype=np.int64), np.ascontiguousarray(actions, dtype=np.int64)
+        if states.ndim != 2 or states.shape[1] != len(self.cardinalities) or actions.shape != (len(states),):
+            raise ValueError(
+                f"A model of {len(self.cardinalities)} factors needs states [B, {len(self.cardinalities)}] and actions [B], "
+                f"got shapes {states.shape} and {actions.shape}."
+            )
+        return states, actions
+
+    def _event_rates(self, states: States, actions: Actions) -> Floats:
+        if not self.fitted.has_event:
+            return np.zeros(len(states))
+        rates: Floats = draws.event_rates(states, actions, self.fitted.layout, self.fitted.usual)
+        return rates
+
+    def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
+        """See TransitionModel."""
+        states, actions = self._rows(states, actions)
+        return self._draw(states, actions, as_keys(rng, len(states)))
+
+    def _draw(self, states: States, actions: Actions, keys: Keys, greedy: bool = False) -> tuple[States, Bools]:
+        """Draws by keys, or takes the likeliest value of each unit."""
+        fitted, following, over = self.fitted, states.copy(), np.zeros(len(states), dtype=np.bool_)
+        draws.sample(states, actions, keys, greedy, fitted.layout, fitted.usual, fitted.late, following, over)
+        luck = 0.5 if greedy else uniforms(derive(keys, _EVENT), 1)[:, 0]
+        happens = np.flatnonzero(luck < self._event_rates(states, actions))
+        if len(happens):
+            given, event = states[happens], fitted.event
+            redrawn, ends = given.copy(), np.zeros(len(happens), dtype=np.bool_)
+            late = nothing_late(event)
+            draws.sample(given, actions[happens], keys[happens], greedy, fitted.layout, event, late, redrawn, ends)
+            following[happens], over[happens] = redrawn, ends
+        return following, over
+
+    def likeliest(self, states: States, actions: Actions) -> tuple[States, Bools]:
+        """The likeliest next states, unit by unit, int64 [B, F], and whether they end the episode, bool [B]."""
+        states, actions = self._rows(states, actions)
+        return self._draw(states, actions, np.zeros(len(states), dtype=np.uint64), greedy=True)
+
+    def marginals(self, states: States, actions: Actions) -> Floats:
+        """See TransitionModel."""
+        states, actions = self._rows(states, actions)
+        start = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64)
+        fitted, probs = self.fitted, np.empty((len(states), int(start[-1])))
+        draws.marginals(states, actions, fitted.layout, fitted.usual, start, probs)
+        if fitted.has_event:
+            rate, redrawn = self._event_rates(states, actions)[:, None], np.empty_like(probs)
+            draws.marginals(states, actions, fitted.layout, fitted.event, start, redrawn)
+            probs += rate * (redrawn - probs)
+        return probs
+
+    def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
+        """See TransitionModel; exact for the distribution that ``sample`` draws from."""
+        states, actions = self._rows(states, actions)
+        following, over = np.ascontiguousarray(next_states, dtype=np.int64), np.ascontiguousarray(terminated, dtype=np.bool_)
+        layout = self.fitted.layout
+        usual: Floats = draws.log_prob(states, actions, following, over, layout, self.fitted.usual, self.fitted.late)
+        if not self.fitted.has_event:
+            return usual
+        rate = self._event_rates(states, actions)
+        event = draws.log_prob(states, actions, following, over, layout, self.fitted.event, nothing_late(self.fitted.event))
+        with np.errstate(divide="ignore"):
+            return np.logaddexp(np.log1p(-rate) + usual, np.log(rate) + event)
+
+    def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
+        """See TransitionModel; systematic draws, see ``models/systematic.py``."""
+        states, actions = self._rows(states, actions)
+        usual = self._successors(states, actions, self.fitted.usual, self.fitted.late, n_samples, seed)
+        rates = self._event_rates(states, actions)
+        happens = np.flatnonzero(rates >= 1.0 / n_samples)
+        if len(happens) == 0:
+            return usual
+        late = nothing_late(self.fitted.event)
+        event = self._successors(states[happens], actions[happens], self.fitted.event, late, n_samples, seed)
+        return mixed(usual, event, happens, rates)
+
+    def _successors(
+        self, states: States, actions: Actions, graphs: Graphs, late: Graphs, n_samples: int, seed: int
+    ) -> Successors:
+        key, offset = start(seed)
+        layout, n_outputs = self.fitted.layout, states.shape[1] + 1
+        step = rows_at_once(n_samples, n_outputs)
+        parts = [
+            successors(states[b : b + step], actions[b : b + step], layout, graphs, late, n_samples, key, offset)
+            for b in range(0, len(states), step)
+        ]
+        return assemble(parts, n_samples, n_outputs)

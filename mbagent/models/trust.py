@@ -1,0 +1,145 @@
+"""How far a model can be trusted: the probability that what it foretells is wrong (the paper's section 6, model error).
+
+A model knows how random the world is, not how wrong it may be itself. Models learned from other samples of the same episodes
+disagree where there is little to go by (Breiman 1996, "Bagging predictors"); how often predictions with so much doubt were wrong
+on held-out episodes makes an honest probability of it (isotonic regression; Zadrozny and Elkan 2002).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import isotonic_regression
+
+from mbagent.models.base import Actions, Bools, Floats, States, TransitionModel
+from mbagent.transitions import TransitionBatch, TransitionDataset
+
+BELIEVED = 20.0
+"""Held-out transitions that a doubt counts for as it stands."""
+
+
+@dataclass(frozen=True)
+class ModelError:
+    """The estimated error of a model.
+
+    Attributes:
+        model: the model.
+        members: models of other samples of its data.
+        doubts: doubts with known errors, ascending, [K].
+        rates: how often predictions with such a doubt are wrong, [K].
+    """
+
+    model: TransitionModel
+    members: tuple[TransitionModel, ...]
+    doubts: Floats
+    rates: Floats
+
+    def __call__(self, states: States, actions: Actions) -> Floats:
+        """Probability that the likeliest next state is not what comes, by chance or by error, [B]."""
+        return np.interp(self.doubt(states, actions), self.doubts, self.rates)
+
+    def doubt(self, states: States, actions: Actions) -> Floats:
+        """Probability of anything else than the model's likeliest outcome, mean over the model and all members, [B]."""
+        following, ends = likeliest(self.model, states, actions)
+        logs = [model.log_prob(states, actions, following, ends) for model in (self.model, *self.members)]
+        result: Floats = 1.0 - np.exp(logs).mean(axis=0)
+        return result.clip(0.0, 1.0)
+
+    def disagreement(self, states: States, actions: Actions) -> Floats:
+        """Standard deviation, over the models, of the probability of the likeliest outcome, [B]: what more data would settle."""
+        following, ends = likeliest(self.model, states, actions)
+        logs = [model.log_prob(states, actions, following, ends) for model in (self.model, *self.members)]
+        result: Floats = np.exp(logs).std(axis=0)
+        return result
+
+
+def estimate_error(
+    build: Callable[[], TransitionModel],
+    model: TransitionModel,
+    data: TransitionDataset,
+    *,
+    n_members: int = 4,
+    validation: float = 0.2,
+    seed: int = 0,
+) -> ModelError:
+    """Learns how wrong a model may be.
+
+    Args:
+        build: makes a new model of its kind.
+        model: the model, fitted to ``data``; it needs exact probabilities.
+        data: what it was fitted to.
+        n_members: models to hold beside it, each fitted to a sample of the episodes that are not held out.
+        validation: share of episodes held out.
+        seed: of samples and splits.
+
+    Raises:
+        ValueError: there are fewer than 50 transitions, or no members.
+    """
+    if len(data) < 50 or n_members < 1:
+        raise ValueError(
+            f"An error estimate needs at least 50 transitions and 1 member, got {len(data)} and {n_members}; explore first."
+        )
+    train, held_out = data.split(validation, seed)
+    rng = np.random.default_rng(seed)
+
+    def fitted(rows: TransitionBatch, number: int) -> TransitionModel:
+        sample = TransitionDataset(data.cardinalities, data.n_actions)
+        sample.append(rows)
+        member = build()
+        member.fit(sample, seed=seed + number)
+        return member
+
+    members = tuple(fitted(resampled(train, rng), number) for number in range(n_members))
+    before = ModelError(fitted(train, 0), members, np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+    doubts = before.doubt(held_out.states, held_out.actions)
+    wrong = missed(before.model, held_out)
+    return ModelError(model, members, *_calibrated(doubts, wrong))
+
+
+def resampled(rows: TransitionBatch, rng: np.random.Generator, least: int = 10) -> TransitionBatch:
+    """As many episodes, drawn with replacement, each an episode of its own; few long ones are cut into runs first."""
+    groups = np.unique(rows.episodes, return_inverse=True)[1]
+    if groups.max() + 1 < least:
+        groups = np.arange(len(rows)) * least // len(rows)
+    chosen = rng.integers(groups.max() + 1, size=groups.max() + 1)
+    order = np.argsort(groups, kind="stable")
+    begin = np.searchsorted(groups[order], np.arange(groups.max() + 2))
+    parts = [order[begin[g] : begin[g + 1]] for g in chosen]
+    drawn = rows.select(np.concatenate(parts))
+    return replace(drawn, episodes=np.repeat(np.arange(len(parts)), [len(part) for part in parts]))
+
+
+def likeliest(model: TransitionModel, states: States, actions: Actions) -> tuple[States, Bools]:
+    """A model's likeliest next states, int64 [B, F], and ends, bool [B]: its own word, or each factor's likeliest value."""
+    own = getattr(model, "likeliest", None)
+    if own is not None:
+        found: tuple[States, Bools] = own(states, actions)
+        return found
+    probs, start = model.marginals(states, actions), np.concatenate([[0], np.cumsum(model.cardinalities)])
+    columns = [probs[:, begin:end].argmax(axis=1) for begin, end in itertools.pairwise(start)]
+    following = np.stack(columns, axis=1).astype(np.int64)
+    logs = [model.log_prob(states, actions, following, np.full(len(states), end)) for end in (False, True)]
+    return following, logs[1] > logs[0]
+
+
+def missed(model: TransitionModel, rows: TransitionBatch) -> Bools:
+    """In which rows the likeliest outcome is not what came, bool [N]."""
+    following, ends = likeliest(model, rows.states, rows.actions)
+    result: Bools = (following != rows.next_states).any(axis=1) | (ends != rows.terminated)
+    return result
+
+
+def _calibrated(doubts: Floats, wrong: Bools) -> tuple[Floats, Floats]:
+    """Doubts and how often they were right, ascending; with few held-out transitions a doubt is believed as it stands."""
+    own = np.quantile(doubts, np.linspace(0.0, 1.0, 11)) if len(doubts) else np.zeros(0)
+    x = np.concatenate([doubts, own, [0.0, 1.0]])
+    y = np.concatenate([wrong.astype(np.float64), own, [0.0, 1.0]])
+    weights = np.concatenate([np.ones(len(doubts)), np.full(len(own), BELIEVED / 13.0), np.full(2, BELIEVED / 13.0)])
+    order = np.argsort(x, kind="stable")
+    levels, place = np.unique(x[order], return_inverse=True)
+    total = np.bincount(place, weights=weights[order])
+    mean = np.bincount(place, weights=(weights * y)[order]) / total
+    return levels, isotonic_regression(mean, weights=total).x

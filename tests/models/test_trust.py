@@ -1,0 +1,65 @@
+"""Error estimates: honest on a world that is half known, rising where nothing was seen."""
+
+import numpy as np
+import pytest
+
+from mbagent.models.graphs import DecisionGraphModel
+from mbagent.models.tabular import TabularModel
+from mbagent.models.trust import estimate_error, likeliest, missed, resampled
+from mbagent.transitions import TransitionDataset
+from tests.models.helpers import dataset
+
+CARDS = (30, 2)
+
+
+def world(n: int, seed: int) -> TransitionDataset:
+    """A table of thirty places that lead anywhere, low ones met often, and a biased coin."""
+    rng = np.random.default_rng(seed)
+    table = np.random.default_rng(9).integers(30, size=(30, 2))
+    place = np.minimum(rng.geometric(0.12, size=n) - 1, 29)
+    actions = rng.integers(2, size=n)
+    states = np.stack([place, rng.integers(2, size=n)], axis=1)
+    following = np.stack([table[place, actions], rng.random(n) < 0.1], axis=1).astype(np.int64)
+    return dataset(CARDS, 2, states, actions, following)
+
+
+def test_estimated_errors_are_those_met() -> None:
+    data = world(400, 0)
+    model = DecisionGraphModel(CARDS, 2)
+    model.fit(data)
+    error = estimate_error(lambda: DecisionGraphModel(CARDS, 2), model, data)
+    rows = world(20_000, 1).rows()
+    estimated, wrong = error(rows.states, rows.actions), missed(model, rows)
+    assert abs(estimated.mean() - wrong.mean()) < 0.05
+    known = np.isin(rows.states[:, 0], np.arange(5))
+    unknown = rows.states[:, 0] > 20
+    assert abs(estimated[known].mean() - wrong[known].mean()) < 0.05
+    assert abs(estimated[unknown].mean() - wrong[unknown].mean()) < 0.15
+    assert estimated[unknown].mean() > estimated[known].mean() + 0.05
+    apart = error.disagreement(rows.states, rows.actions)
+    assert apart[unknown].mean() > apart[known].mean()
+
+
+def test_models_without_a_likeliest_state_of_their_own_have_each_factors() -> None:
+    data = world(2000, 0)
+    model = TabularModel(CARDS, 2)
+    model.fit(data)
+    rows = data.rows()
+    found, ends = likeliest(model, rows.states, rows.actions)
+    probs = model.marginals(rows.states, rows.actions)
+    np.testing.assert_array_equal(found[:, 0], probs[:, :30].argmax(axis=1))
+    assert not ends.any()
+
+
+def test_resampled_episodes_stay_whole() -> None:
+    rows = world(400, 0).rows()
+    drawn = resampled(rows, np.random.default_rng(0))
+    assert len(drawn) == 400
+    assert len(np.unique(drawn.episodes)) == 20
+    whole = {rows.states[rows.episodes == episode].tobytes() for episode in np.unique(rows.episodes)}
+    assert all(drawn.states[drawn.episodes == episode].tobytes() in whole for episode in np.unique(drawn.episodes))
+
+
+def test_too_little_data_is_one_clear_sentence() -> None:
+    with pytest.raises(ValueError, match="at least 50"):
+        estimate_error(lambda: DecisionGraphModel(CARDS, 2), DecisionGraphModel(CARDS, 2), world(20, 0))
