@@ -1,7 +1,7 @@
 """How far a model can be trusted: the probability that what it foretells is wrong (the paper's section 6, model error).
 
-A model knows how random the world is, not how wrong it may be itself. Models learned from other samples of the same episodes
-disagree where there is little to go by (Breiman 1996, "Bagging predictors"); how often predictions with so much doubt were wrong
+A model knows how random the world is, not how wrong it may be itself. Models learned without one part of the episodes or
+another disagree where there is little to go by (the jackknife); how often predictions with so much doubt were wrong
 on held-out episodes makes an honest probability of it (isotonic regression; Zadrozny and Elkan 2002).
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import isotonic_regression
@@ -21,13 +21,16 @@ BELIEVED = 20.0
 """Held-out transitions that a doubt counts for as it stands."""
 
 
+_AS_IT_STANDS = np.array([0.0, 1.0]), np.array([0.0, 1.0])
+
+
 @dataclass(frozen=True)
 class ModelError:
     """The estimated error of a model.
 
     Attributes:
         model: the model.
-        members: models of other samples of its data.
+        members: models of its data without one part or another.
         doubts: doubts with known errors, ascending, [K].
         rates: how often predictions with such a doubt are wrong, [K].
     """
@@ -61,7 +64,7 @@ def estimate_error(
     model: TransitionModel,
     data: TransitionDataset,
     *,
-    n_members: int = 4,
+    n_members: int = 5,
     validation: float = 0.2,
     seed: int = 0,
 ) -> ModelError:
@@ -71,45 +74,39 @@ def estimate_error(
         build: makes a new model of its kind.
         model: the model, fitted to ``data``; it needs exact probabilities.
         data: what it was fitted to.
-        n_members: models to hold beside it, each fitted to a sample of the episodes that are not held out.
+        n_members: models to hold beside it, each fitted to all but one of as many parts of the episodes; twice as many are
+            fitted, and one more, to learn how often they are wrong.
         validation: share of episodes held out.
         seed: of samples and splits.
 
     Raises:
         ValueError: there are fewer than 50 transitions, or no members.
     """
-    if len(data) < 50 or n_members < 1:
+    if len(data) < 50 or n_members < 2:
         raise ValueError(
-            f"An error estimate needs at least 50 transitions and 1 member, got {len(data)} and {n_members}; explore first."
+            f"An error estimate needs at least 50 transitions and 2 members, got {len(data)} and {n_members}; explore first."
         )
     train, held_out = data.split(validation, seed)
-    rng = np.random.default_rng(seed)
 
-    def fitted(rows: TransitionBatch, number: int) -> TransitionModel:
+    def fitted(rows: TransitionBatch) -> TransitionModel:
         sample = TransitionDataset(data.cardinalities, data.n_actions)
         sample.append(rows)
         member = build()
-        member.fit(sample, seed=seed + number)
+        member.fit(sample, seed=seed)
         return member
 
-    members = tuple(fitted(resampled(train, rng), number) for number in range(n_members))
-    before = ModelError(fitted(train, 0), members, np.array([0.0, 1.0]), np.array([0.0, 1.0]))
-    doubts = before.doubt(held_out.states, held_out.actions)
-    wrong = missed(before.model, held_out)
-    return ModelError(model, members, *_calibrated(doubts, wrong))
+    inner = ModelError(fitted(train), tuple(map(fitted, with_gaps(train, n_members, seed))), *_AS_IT_STANDS)
+    curve = _calibrated(inner.doubt(held_out.states, held_out.actions), missed(inner.model, held_out))
+    return ModelError(model, tuple(map(fitted, with_gaps(data.rows(), n_members, seed))), *curve)
 
 
-def resampled(rows: TransitionBatch, rng: np.random.Generator, least: int = 10) -> TransitionBatch:
-    """As many episodes, drawn with replacement, each an episode of its own; few long ones are cut into runs first."""
+def with_gaps(rows: TransitionBatch, n_parts: int, seed: int) -> list[TransitionBatch]:
+    """The rows without one part of the episodes, once for each of ``n_parts``; few long episodes are cut into runs first."""
     groups = np.unique(rows.episodes, return_inverse=True)[1]
-    if groups.max() + 1 < least:
-        groups = np.arange(len(rows)) * least // len(rows)
-    chosen = rng.integers(groups.max() + 1, size=groups.max() + 1)
-    order = np.argsort(groups, kind="stable")
-    begin = np.searchsorted(groups[order], np.arange(groups.max() + 2))
-    parts = [order[begin[g] : begin[g + 1]] for g in chosen]
-    drawn = rows.select(np.concatenate(parts))
-    return replace(drawn, episodes=np.repeat(np.arange(len(parts)), [len(part) for part in parts]))
+    if groups.max() + 1 < 2 * n_parts:
+        groups = np.arange(len(rows)) * 2 * n_parts // len(rows)
+    part = np.random.default_rng(seed).permutation(groups.max() + 1) % n_parts
+    return [rows.select(part[groups] != number) for number in range(n_parts)]
 
 
 def likeliest(model: TransitionModel, states: States, actions: Actions) -> tuple[States, Bools]:
