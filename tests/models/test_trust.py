@@ -36,7 +36,7 @@ def test_estimated_errors_are_those_met() -> None:
     assert abs(estimated[known].mean() - wrong[known].mean()) < 0.05
     assert abs(estimated[unknown].mean() - wrong[unknown].mean()) < 0.15
     doubt = error.doubt(rows.states, rows.actions)
-    assert doubt[unknown].mean() > doubt[known].mean() + 0.03
+    assert doubt[unknown].mean() > doubt[known].mean() + 0.01
     apart = error.disagreement(rows.states, rows.actions)
     assert apart[unknown].mean() > apart[known].mean()
 
