@@ -2,7 +2,8 @@
 
 python scripts/model_accuracy.py                          # quick: one seed, 2,000 and 5,000 steps, 20,000 tests
 python scripts/model_accuracy.py --full                   # 5 seeds, 2,000, 5,000 and 20,000 steps, 100,000 tests
-python scripts/model_accuracy.py --models graphs --cases "Maneuverer, flat"
+python scripts/model_accuracy.py --models graphs --cases "Maneuverer, flat" --studies
+python scripts/model_accuracy.py --cases --studies changes cost
 
 """
 
@@ -14,16 +15,22 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import csv
+import importlib.util
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
+import torch
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 from mbagent.analysis.folders import replaced, set_aside
 from mbagent.analysis.model_accuracy.experiment import CASES, Outcome, Score, Settings, means, plan, run_task
+from mbagent.analysis.model_accuracy.page import averaged, shown, write_page
+from mbagent.analysis.model_accuracy.studies import STUDIES
 from mbagent.analysis.parallel import run_all
 
 
@@ -47,6 +54,9 @@ class Args:
     """Transitions to test on; by default 20,000, with --full 100,000."""
     output: Path = Path("results/model_accuracy")
     """Folder for results.csv; results of an earlier run there are moved to a folder of their own inside it."""
+    studies: tuple[str, ...] = tuple(name for name in STUDIES if name != "minatar")
+    """Further questions: changes of rules, transfer between sizes, cost, parents found, error estimates (trust), planning
+    (agents); minatar needs pip install "mbagent[minatar]". None with --studies alone."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Number of processes, each with one thread."""
 
@@ -89,12 +99,58 @@ def show(scores: list[Score], console: Console) -> None:
     Console(width=max(console.width, 120)).print(table)
 
 
+@dataclass(frozen=True)
+class Question:
+    """One study with one seed."""
+
+    study: str
+    seed: int
+    full: bool
+
+
+def answer(question: Question) -> tuple[Question, list[dict[str, Any]]]:
+    """Runs a study."""
+    torch.set_num_threads(1)
+    return question, STUDIES[question.study](question.seed, question.full)
+
+
+def check_studies(names: Sequence[str]) -> None:
+    """Refuses unknown studies, and those whose packages are missing.
+
+    Raises:
+        ValueError: there is one.
+    """
+    for name in names:
+        if name not in STUDIES:
+            raise ValueError(f"There is no study {name!r}; choose from {', '.join(STUDIES)}.")
+    if "minatar" in names and importlib.util.find_spec("minatar") is None:
+        raise ValueError('The study minatar needs MinAtar: pip install "mbagent[minatar]".')
+
+
+def save_rows(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Writes a csv with a line for each row of a study."""
+    with replaced(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def show_rows(study: str, rows: list[dict[str, Any]], console: Console) -> None:
+    """Prints a study's means over seeds."""
+    table = Table(*rows[0], title=(STUDIES[study].__doc__ or "").splitlines()[0])
+    for row in rows:
+        table.add_row(*(shown(value) for value in row.values()))
+    Console(width=max(console.width, 120)).print(table)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Runs the command line and returns its exit code."""
     args = tyro.cli(Args, args=argv, description=__doc__.splitlines()[0])
     console = Console()
     try:
-        tasks = plan(settings_of(args))
+        settings = settings_of(args)
+        tasks = plan(settings) if args.cases else []
+        check_studies(args.studies)
     except ValueError as error:
         console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
         return 1
@@ -102,6 +158,7 @@ def main(argv: list[str] | None = None) -> int:
     if moved := set_aside(args.output):
         console.print(f"Moved earlier results to {moved}.", highlight=False, soft_wrap=True)
     scores: list[Score] = []
+    rows: dict[str, list[dict[str, Any]]] = {}
 
     def line(outcome: Outcome) -> str:
         return f"{outcome.task.case.name}, {outcome.task.steps} steps, seed {outcome.task.seed}"
@@ -109,8 +166,21 @@ def main(argv: list[str] | None = None) -> int:
     for outcome in run_all(run_task, tasks, workers=args.workers, console=console, name=line):
         scores += outcome.scores
         save(args.output / "results.csv", scores)
-    show(scores, console)
-    console.print(f"Wrote results.csv to {args.output}.", highlight=False, soft_wrap=True)
+    if scores:
+        show(scores, console)
+    questions = [Question(name, args.first_seed + i, args.full) for name in args.studies for i in range(settings.seeds)]
+    for question, found in run_all(
+        answer, questions, workers=args.workers, console=console, name=lambda done: f"{done[0].study}, seed {done[0].seed}"
+    ):
+        rows.setdefault(question.study, []).extend(found)
+        save_rows(args.output / f"{question.study}.csv", rows[question.study])
+    accuracy = [{"world": c, "model": m, "steps": n, **figures} for (c, m, n), figures in sorted(means(scores).items())]
+    pictures = write_page(args.output / "report.html", rows, accuracy, "scripts/model_accuracy.py" + " --full" * args.full)
+    for name, png in pictures.items():
+        (args.output / f"{name}.png").write_bytes(png)
+    for study, found in rows.items():
+        show_rows(study, averaged(study, found), console)
+    console.print(f"Wrote report.html and the tables to {args.output}.", highlight=False, soft_wrap=True)
     return 0
 
 

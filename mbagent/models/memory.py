@@ -27,6 +27,11 @@ def first_rows(rows: TransitionBatch, most: int) -> TransitionBatch:
     return rows.select(np.arange(min(len(rows), most)))
 
 
+def thinned(rows: TransitionBatch, most: int) -> TransitionBatch:
+    """Evenly chosen transitions."""
+    return rows.select(np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)) if len(rows) else rows
+
+
 def following_steps(rows: TransitionBatch) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Numbers of the transitions that follow another in the same episode, and of those; episodes may be interleaved."""
     order = np.argsort(rows.episodes, kind="stable")

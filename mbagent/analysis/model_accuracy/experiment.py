@@ -90,8 +90,8 @@ class Settings:
         for name in self.cases:
             if name not in names:
                 raise ValueError(f"There is no case {name!r}; choose from {', '.join(map(repr, names))}.")
-        if not self.cases or not self.models:
-            raise ValueError("There is nothing to measure: name at least one case and one model.")
+        if not self.models:
+            raise ValueError("There is nothing to measure: name at least one model.")
         for name in self.models:
             build_model(name, FactoredSpace(MultiBinary(1)), 1, LEARNING_RATE)  # an unknown name is told before all work
         if not self.steps or min(self.steps) < EPISODE:

@@ -23,6 +23,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from mbagent.agent import ModelLearningAgent
 from mbagent.analysis.model_accuracy.changed import CHANGES
 from mbagent.analysis.model_accuracy.experiment import CASES, LEARNING_RATE, certain_factors, random_play
+from mbagent.analysis.model_accuracy.minatar import minatar
 from mbagent.models.base import Bools, Floats, TransitionModel
 from mbagent.models.factory import build_model
 from mbagent.models.graphs import DecisionGraphModel, LocalGraphModel
@@ -199,7 +200,8 @@ def trust(seed: int, full: bool) -> list[Row]:
             inside = (estimated >= low) & (estimated < high)
             if inside.sum() >= 20:
                 means = {"estimate": float(estimated[inside].mean()), "rate": float(wrong[inside].mean())}
-                rows.append({"world": name, "steps": steps, **summary, "in bin": int(inside.sum()), **means})
+                label = {"world": name, "steps": steps, "bin": f"from {low:g}"}
+                rows.append({**label, **summary, "in bin": int(inside.sum()), **means})
     return rows
 
 
@@ -241,4 +243,5 @@ STUDIES: dict[str, Callable[[int, bool], list[Row]]] = {
     "parents": parents,
     "trust": trust,
     "agents": agents,
+    "minatar": minatar,
 }

@@ -39,7 +39,7 @@ Bools: TypeAlias = NDArray[np.bool_]
 Floats: TypeAlias = NDArray[np.float64]
 
 MOST_CELLS = 200_000_000
-"""Entries of the table of columns that the search reads; of more transitions than that, the first are searched."""
+"""Entries of the table of columns that the search reads; of more transitions than that, some from all over are searched."""
 
 CHUNK = 50_000_000
 """Entries of the table that are made at once."""
@@ -91,29 +91,35 @@ class PlaneTable:
         self.near, self.far, self.next_far = (
             known[which] for which in (here, np.isin(kind, (MEETING, ACTION)), kind == NEXT_MEETING)
         )
-        self.table, self.pattern, n_rows = self._looks(every[0], rows.actions)
-        self.rows, self.before, self.after = rows.select(np.arange(n_rows)), every[0][:n_rows], every[1][:n_rows]
+        self.table, self.pattern, taken = self._looks(every[0], rows.actions)
+        self.rows, self.before, self.after = rows.select(taken), every[0][taken], every[1][taken]
+        self.since = np.searchsorted(taken, self.since)
         self.actions = np.repeat(self.rows.actions, self.n_cells)
 
-    def _looks(self, planes: Ints, actions: Ints) -> tuple[Bools, Ints, int]:
-        """Columns of all cells that look different, which each cell looks like, and how many transitions that is of.
+    def _looks(self, planes: Ints, actions: Ints) -> tuple[Bools, Ints, Ints]:
+        """Columns of all cells that look different, which each cell looks like, and which transitions that is of.
 
-        Transitions are taken as long as there is room.
+        Transitions from all over are taken as long as there is room.
         """
         most, step = MOST_CELLS // max(len(self.near), 1), max(1, CHUNK // (self.n_cells * max(len(self.near), 1)))
-        looks, pattern, n_rows = np.zeros((0, -(-len(self.near) // 8)), dtype=np.uint8), [np.zeros(0, dtype=np.int64)], 0
-        while n_rows < len(planes) and len(looks) < most:
-            part = slice(n_rows, n_rows + step)
+        looks, n_parts = np.zeros((0, -(-len(self.near) // 8)), dtype=np.uint8), -(-len(planes) // step)
+        pattern, taken = [np.zeros((0, self.n_cells), dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+        for number in range(n_parts):
+            if len(looks) >= most:
+                break
+            part = np.arange(number, len(planes), n_parts)
             packed = np.packbits(column_values(self.columns[self.near], planes[part], actions[part]), axis=1)
             first, of = distinct(packed)
             both, known = np.concatenate([looks, packed[first]]), len(looks)
             kept, now = distinct(both)
             renamed = np.argsort(np.argsort(kept, kind="stable"), kind="stable")[now]  # looks known before keep their numbers
             looks = both[np.sort(kept)]
-            pattern.append(renamed[known:][of])
-            n_rows += len(planes[part])
+            pattern.append(renamed[known:][of].reshape(len(part), self.n_cells))
+            taken.append(part)
+        rows = np.concatenate(taken)
+        order = np.argsort(rows)
         table = np.unpackbits(looks, axis=1, count=len(self.near)).astype(np.bool_)
-        return table, np.concatenate(pattern), min(n_rows, len(planes))
+        return table, np.concatenate(pattern)[order].ravel(), rows[order]
 
     def seen(self, channel: int) -> Seen:
         """A channel's values in all cells; looks are rows of ``table``."""

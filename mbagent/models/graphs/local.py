@@ -24,7 +24,7 @@ from mbagent.models.graphs.recency import still_true_since
 from mbagent.models.graphs.search import Search
 from mbagent.models.graphs.units import Question
 from mbagent.models.graphs.windows import NEXT, NEXT_MEETING, Reach, named_column, relative_columns
-from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, first_rows
+from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, thinned
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.transitions import TransitionBatch, TransitionDataset
 
@@ -133,7 +133,7 @@ class LocalGraphModel(DecisionGraphModel):
         """The least reach under which held-out transitions are foretold no worse than under larger ones; from some rows."""
         if len(held_out) == 0:
             return Reach()
-        some, tests = first_rows(train, SOME_ROWS), first_rows(held_out, SOME_TESTS)
+        some, tests = thinned(train, SOME_ROWS), thinned(held_out, SOME_TESTS)
         best, logs = Reach(), self._reaching(Reach(), some, tests)
         most = min(LARGEST_RADIUS, max(self.board.height, self.board.width) // 2)
         while best.radius < most and logs.mean() < FORETOLD:
