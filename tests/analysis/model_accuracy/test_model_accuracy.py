@@ -95,7 +95,7 @@ def test_the_true_model_makes_no_mistake() -> None:
 
 def test_a_small_run_is_written_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cases = ["GeyserRunner, deterministic", "GeyserRunner, stochastic"]
-    options = ["--cases", *cases, "--models", "graphs", "--steps", "1000", "--n-tests", "500"]
+    options = ["--cases", *cases, "--models", "graphs", "--steps", "1000", "--n-tests", "500", "--studies"]
     assert main([*options, "--workers", "1", "--output", str(tmp_path)]) == 0
     assert len((tmp_path / "results.csv").read_text(encoding="utf-8").splitlines()) == 3
     assert "100.00%" in capsys.readouterr().out
@@ -106,7 +106,8 @@ def test_a_small_run_is_written_and_shown(tmp_path: Path, capsys: pytest.Capture
     ("wrong", "told"),
     [
         (["--cases", "Chess"], "no case 'Chess'"),
-        (["--models"], "at least one case and one model"),
+        (["--models"], "at least one model"),
+        (["--studies", "all"], "no study 'all'"),
         (["--models", "none"], "no model called 'none'"),
         (["--steps", "5"], "must be 100 or more"),
         (["--seeds", "0"], "seeds must be at least 1"),
