@@ -69,6 +69,7 @@ class PlaneTable:
         columns: all relative columns, int64 [D, 7].
         n_actions: number of actions A.
         since: first row that counts for each channel and for ``terminated``, int64 [C + 1]; None for all.
+        in_pairs: whether to look for causes that matter only together, which takes most of the time.
     """
 
     def __init__(
@@ -79,8 +80,10 @@ class PlaneTable:
         columns: Ints,
         n_actions: int,
         since: Ints | None = None,
+        in_pairs: bool = True,
     ) -> None:
         """See the class."""
+        self.in_pairs = in_pairs
         self.board, self.cardinalities, self.columns, self.n_actions = board, cardinalities, columns, n_actions
         self.n_cells = board.height * board.width
         self.since = np.zeros(len(cardinalities) + 1, dtype=np.int64) if since is None else since
@@ -137,7 +140,8 @@ class PlaneTable:
 
     def split(self, asked: Sequence[Question], table: Bools, numbers: Ints) -> list[Search]:
         """Splits by columns of a table, which have these numbers among the relative ones."""
-        found = find_splits([q.head for q in asked], table, column_kinds(self.columns)[numbers], self.n_actions)
+        kinds = column_kinds(self.columns)[numbers]
+        found = find_splits([q.head for q in asked], table, kinds, self.n_actions, self.in_pairs)
         return [search.renamed(numbers) for search in found]
 
     def build(self, asked: Sequence[Question], found: Sequence[Search]) -> Graphs:

@@ -121,7 +121,7 @@ class LocalGraphModel(DecisionGraphModel):
 
     def _look(self, rows: TransitionBatch) -> None:
         """Learns quickly."""
-        self._learn(rows, jointly=False)
+        self._learn(rows, jointly=False, in_pairs=False)
 
     def _kept(self) -> Any:
         return self.local, self.fitted, self.reach
@@ -150,10 +150,10 @@ class LocalGraphModel(DecisionGraphModel):
         self._forget(self.local.cardinalities, reach)
         return self._foretold(train, tests)
 
-    def _learn(self, rows: TransitionBatch, jointly: bool = True, since: Ints | None = None) -> None:
+    def _learn(self, rows: TransitionBatch, jointly: bool = True, since: Ints | None = None, in_pairs: bool = True) -> None:
         """Graphs first, each cell for itself; then what is never on together, and what hangs on what others become."""
         local = self.local
-        planes = PlaneTable(rows, self.board, local.cardinalities, local.columns, self.n_actions, since)
+        planes = PlaneTable(rows, self.board, local.cardinalities, local.columns, self.n_actions, since, in_pairs)
         graphs, asked, found = learn_channels(planes)
         self.local = replace(local, graphs=graphs, late=nothing_late(graphs), couplings=())
         self._instantiate((), ())

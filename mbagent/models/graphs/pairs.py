@@ -33,7 +33,7 @@ FIRST = 3.0
 LEAST = 1.0
 """Least price of a cause, nats, however likely the prior makes it."""
 
-MOST_WORK = 40_000_000_000
+MOST_WORK = 5_000_000_000
 """Pairs of columns are looked for in a context as long as rows times columns times columns stay below this."""
 
 TELLING = 2
