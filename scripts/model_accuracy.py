@@ -43,7 +43,7 @@ class Args:
     cases: tuple[str, ...] = tuple(case.name for case in CASES)
     """Which worlds."""
     models: tuple[str, ...] = ("graphs", "networks")
-    """Which models."""
+    """Which models: any by name, and bayesnet, a dynamic Bayesian network by pyAgrum (pip install "mbagent[yardsticks]")."""
     steps: tuple[int, ...] | None = None
     """Steps of random play to learn from; by default 2,000 and 5,000, with --full 20,000 too."""
     seeds: int | None = None

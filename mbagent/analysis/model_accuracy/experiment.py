@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import MultiBinary
 
+from mbagent.analysis.model_accuracy import bayesnet
 from mbagent.analysis.model_accuracy.worlds import PushedBox, Switch, TwoPlayers
 from mbagent.models.base import Bools, Floats, States, TransitionModel
 from mbagent.models.factory import build_model
@@ -92,6 +94,10 @@ class Settings:
                 raise ValueError(f"There is no case {name!r}; choose from {', '.join(map(repr, names))}.")
         if not self.models:
             raise ValueError("There is nothing to measure: name at least one model.")
+        if "bayesnet" in self.models:
+            if importlib.util.find_spec("pyagrum") is None:
+                raise ValueError('The yardstick bayesnet needs pyAgrum: pip install "mbagent[yardsticks]".')
+            bayesnet.register()
         for name in self.models:
             build_model(name, FactoredSpace(MultiBinary(1)), 1, LEARNING_RATE)  # an unknown name is told before all work
         if not self.steps or min(self.steps) < EPISODE:
@@ -178,6 +184,8 @@ def random_play(game: Game, n_steps: int, seed: int, order: States) -> Transitio
 
 def run_task(task: Task) -> Outcome:
     """Learns and measures."""
+    if "bayesnet" in task.settings.models:
+        bayesnet.register()
     torch.set_num_threads(1)
     game, seed = task.case.game(), task.seed
     true, space = SimulatorModel(game), FactoredSpace(game.observation_space)
