@@ -40,6 +40,9 @@ from mbagent.wrapping import wrap_env
 ITERATION_STEPS = 1000
 """Environment steps between two looks at the logger."""
 
+EXPLORING = 0xE8
+"""Salt of the random numbers of exploration: an environment with the same seed must not draw the same ones."""
+
 MAX_START_STATES = 512
 """Start states kept for generating the reachable machine."""
 
@@ -128,7 +131,7 @@ class ModelLearningAgent(SavableAlgorithm):
         self._custom_reward = reward
         self._planning_seed = seed if seed is not None else int(np.random.SeedSequence().generate_state(1)[0] >> 1)
         self._recorder: ExperienceRecorder | None = None
-        self._rng = np.random.default_rng(self._planning_seed)
+        self._rng = np.random.default_rng([self._planning_seed, EXPLORING])
         if _init_setup_model:
             self._setup_model()
 

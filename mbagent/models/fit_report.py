@@ -72,8 +72,8 @@ class FitReport:
         if not self.memory:
             return None
         return (
-            f"The next state hangs on more than the observation and the action: the step before tells {self.memory:.2g} nats a "
-            "transition more; wrap the environment in mbagent.wrappers.History(env, k)."
+            f"The step before tells the model {self.memory:.2g} nats a transition more than the observation and the action do: "
+            "the next state seems to hang on more than these; wrap the environment in mbagent.wrappers.History(env, k)."
         )
 
     def table(self, most: int = 20) -> str:

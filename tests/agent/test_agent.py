@@ -257,3 +257,20 @@ def test_an_observation_outside_the_space_is_refused(runner: ModelLearningAgent,
 def test_version_and_games_are_there() -> None:
     assert mbagent.__version__
     assert GEYSER in gym.registry
+
+
+def test_exploration_draws_other_numbers_than_an_environment_of_the_same_seed() -> None:
+    class Die(gym.Env[Any, Any]):
+        observation_space = gym.spaces.Discrete(4)
+        action_space = gym.spaces.Discrete(4)
+
+        def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[int, dict[str, Any]]:
+            super().reset(seed=seed)
+            return 0, {}
+
+        def step(self, action: Any) -> tuple[int, float, bool, bool, dict[str, Any]]:
+            return int(self.np_random.integers(4)), 0.0, False, False, {}
+
+    agent = ModelLearningAgent("MctsPolicy", Die(), reward=lambda obs, action, next_obs: np.zeros(len(obs)), seed=0)
+    rows = agent.learn(2000, log_interval=None).transitions.rows()
+    assert abs((rows.actions == rows.next_states[:, 0]).mean() - 0.25) < 0.06

@@ -78,3 +78,17 @@ def test_only_steps_that_follow_another_have_a_past() -> None:
     np.testing.assert_array_equal(longer.states[:, 1], now[earlier])
     np.testing.assert_array_equal(longer.next_states[:, 1], now[later])
     np.testing.assert_array_equal(longer.states[:, 2:].argmax(axis=1), rows.actions[earlier])
+
+
+def test_a_velocity_that_is_not_shown_is_noticed_though_an_action_turns_it() -> None:
+    place, speed, rows = 0, 1, []
+    for action in RNG.integers(2, size=3000).tolist():
+        before, speed = place, speed if action == 0 else -speed
+        place += speed
+        if not 0 <= place <= 7:
+            speed, place = -speed, min(max(place, 0), 7)
+        rows.append((before, action, place))
+    now, actions, then = (np.array(column) for column in zip(*rows, strict=True))
+    report = DecisionGraphModel((8,), 2).fit(dataset((8,), 2, now[:, None], actions, then[:, None], episode_length=100))
+    assert report.memory is not None
+    assert report.memory > 0.3

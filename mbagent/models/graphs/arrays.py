@@ -86,6 +86,8 @@ def _sound(graphs: Graphs, layout: Layout, n_columns: int) -> bool:
         and ((graphs.on >= 0) & (graphs.on < numbers))[asks].all()
         and _values_fit(graphs, layout)
         and all(np.isfinite(getattr(graphs, name)).all() for name in _FLOATS)
+        and all((getattr(graphs, name) >= 0.0).all() and (getattr(graphs, name) <= 1.0).all() for name in _FLOATS)
+        and (np.add.reduceat(graphs.base, start[:-1]) <= 1.0 + 1e-6).all()
     )
 
 

@@ -193,13 +193,13 @@ def read(state: Ints, unit: int, layout: Layout) -> int:
 
 @compiled
 def write(state: Ints, unit: int, value: int, layout: Layout) -> None:
-    """Sets a unit's value in a state [F] in which it has the value that ``read`` gives."""
+    """Sets a unit's value in a state [F]."""
     first, last = layout.first[unit], layout.first[unit + 1]
     if last - first == 1:
         state[layout.members[first]] = value
     elif last > first:
-        state[layout.members[first + read(state, unit, layout)]] = 0
-        state[layout.members[first + value]] = 1
+        for member in range(first, last):  # all of them: a state may have come with several on
+            state[layout.members[member]] = 1 if member == first + value else 0
 
 
 @compiled

@@ -173,7 +173,7 @@ def _draw(unit: int, u: float, w: Work, layout: Layout, graphs: Graphs, followin
     chosen = _pick(w.rates, graphs.start[unit], layout.outputs[unit], u, w.values[unit])
     if unit == len(layout.outputs) - 2:
         terminated[b] = chosen == 1
-    elif chosen != w.values[unit]:
+    elif chosen != w.values[unit] or layout.first[unit + 1] > layout.first[unit] + 1:
         write(following, unit, chosen, layout)
 
 

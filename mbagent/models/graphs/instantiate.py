@@ -35,6 +35,11 @@ class Coupling(NamedTuple):
     line: int
     exactly: bool
 
+    def lies_on(self, height: int, width: int) -> bool:
+        """Whether a board has this line at all."""
+        length = {WHOLE: 1, ROW: height, COLUMN: width}[self.kind]
+        return -length <= self.line < length
+
     def cells(self) -> tuple[slice | int, slice | int]:
         """Its rows and columns."""
         rows = self.line if self.kind == ROW else slice(None)
@@ -88,7 +93,10 @@ def with_couplings(layout: Layout, couplings: Sequence[Coupling]) -> Layout:
     """The layout with its couplings; a cell is in the first that claims it."""
     of, exactly = layout.coupling_of.copy(), []
     groups: list[Ints] = []
+    _, height, width = layout.cells.shape
     for coupling in couplings:
+        if not coupling.lies_on(height, width):
+            continue
         members = layout.cells[coupling.channel][coupling.cells()].ravel()
         members = members[of[members] < 0]
         if len(members) > 1:

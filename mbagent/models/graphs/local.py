@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mbagent.models.base import FitReport, Floats
@@ -19,7 +20,7 @@ from mbagent.models.graphs.evidence import Ints
 from mbagent.models.graphs.fitting import Fitted, nothing_late
 from mbagent.models.graphs.instantiate import Coupling, LocalGraphs, instantiate, with_couplings
 from mbagent.models.graphs.model import FORETOLD, DecisionGraphModel
-from mbagent.models.graphs.parents import asked_columns
+from mbagent.models.graphs.parents import asked_columns, hangs_on_action
 from mbagent.models.graphs.recency import still_true_since
 from mbagent.models.graphs.search import Search
 from mbagent.models.graphs.units import Question
@@ -100,6 +101,9 @@ class LocalGraphModel(DecisionGraphModel):
             factors = tuple(int(f) for f in self.fitted.layout.cells[channel].ravel())
             columns = asked_columns(self.local.graphs, channel) | asked_columns(self.local.late, channel)
             names = dict.fromkeys(named_column(self.local.columns[d]) for d in sorted(columns))
+            layout = channel_layout(self.local.cardinalities, self.n_actions)
+            if hangs_on_action(self.local.graphs, channel, layout):
+                names = {"action": None, **{name: None for name in names if not name.startswith("action ")}}
             found.append(Variable(f"channel {channel}", factors, tuple(names)))
         return found
 
@@ -174,12 +178,18 @@ class LocalGraphModel(DecisionGraphModel):
         start = np.concatenate([[0], np.cumsum(self.cardinalities)])[:-1].astype(np.int64)
         return self.board.to_planes(self.marginals(rows.states, rows.actions)[:, start + 1])
 
-    def for_space(self, space: FactoredSpace) -> LocalGraphModel:
+    def for_space(self, space: FactoredSpace | spaces.Space[Any]) -> LocalGraphModel:
         """The same knowledge for planes of another size; nothing is learned anew.
 
+        Args:
+            space: a stack of planes, as a Gymnasium space or factored.
+
         Raises:
-            ValueError: the channels or their values are others.
+            ValueError: it is no stack of planes, or the channels or their values are others.
         """
+        space = space if isinstance(space, FactoredSpace) else FactoredSpace(space)
+        if space.planes is None:
+            raise ValueError(f"for_space carries knowledge of planes over to planes of another size, but got {space.space}.")
         other = LocalGraphModel(space, self.n_actions, self.given, self.validation)
         if other.local.cardinalities != self.local.cardinalities:
             raise ValueError(
@@ -224,8 +234,11 @@ class LocalGraphModel(DecisionGraphModel):
         if not _sound(graphs, late, columns):
             raise ValueError("These weights ask for a next state that is not known yet; load them as they were saved.")
         couplings = tuple(Coupling(int(c), int(k), int(i), bool(e)) for c, k, i, e in table_of(state["couplings"], 4))
-        longest = max(self.board.height, self.board.width)
-        if any(c.channel not in range(len(cards)) or c.kind not in (0, 1, 2) or abs(c.line) >= longest for c in couplings):
+        height, width = self.board.height, self.board.width
+        if any(
+            c.channel not in range(len(cards)) or cards[c.channel] != 2 or c.kind not in (0, 1, 2) or not c.lies_on(height, width)
+            for c in couplings
+        ):
             raise ValueError("These weights couple cells that these planes do not have; load them into a model of the same kind.")
         self.local, self.reach = LocalGraphs(graphs, late, columns, cards, self.n_actions, couplings), reach
         self._instantiate((), ())

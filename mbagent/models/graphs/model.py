@@ -51,7 +51,8 @@ class DecisionGraphModel(GraphPredictions):
     """Each variable's next value by a small decision graph over the few columns that it hangs on.
 
     Bits of which exactly one is on are drawn as one variable. Rare events that redraw almost everything have graphs of
-    their own, and one for whether they happen. All probabilities are exact; a fit takes a second or a few.
+    their own, and one for whether they happen. Probabilities are exact, but that ``log_prob`` and ``marginals`` grant what never
+    changed a tiny probability to change, which draws leave out. A fit takes a second or a few, with very many values more.
 
     Args:
         cardinalities: number of values of each state factor, length F.
@@ -104,7 +105,10 @@ class DecisionGraphModel(GraphPredictions):
         rows, mask = data.rows(), data.held_out(self.validation, seed)
         if not since.any():
             return (*data.split(self.validation, seed), since)
-        mask &= np.arange(len(rows)) >= since.max()
+        new = np.arange(len(rows)) >= since.max()
+        mask &= new
+        if mask.sum() < new.sum() / 20:  # few long episodes: a run of steps instead
+            mask = new & (np.cumsum(new) > 0.9 * new.sum())
         return rows.select(~mask), rows.select(mask), np.searchsorted(np.flatnonzero(~mask), since)
 
     def _factors_foretold(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
@@ -162,7 +166,7 @@ class DecisionGraphModel(GraphPredictions):
     def _look(self, rows: TransitionBatch) -> None:
         """Learns quickly."""
         events = flag_events(rows.states, rows.next_states) & self.fitted.has_event
-        self.fitted = fit_graphs(self.cardinalities, self.n_actions, rows, events, False, False)
+        self.fitted = fit_graphs(self.cardinalities, self.n_actions, rows, events, True, False)
 
     def _kept(self) -> Any:
         return self.fitted
@@ -173,8 +177,8 @@ class DecisionGraphModel(GraphPredictions):
     def _jointly(self, held_out: TransitionBatch) -> tuple[float, bool]:
         """Held-out likelihood, and whether it is better for drawing some units late."""
         likelihood = self._likelihood(self.fitted, held_out)
-        if len(self.fitted.late.changing) == 0:
-            return likelihood, False
+        if len(self.fitted.late.changing) == 0 or len(held_out) == 0:
+            return likelihood, len(self.fitted.late.changing) > 0
         apart = self._likelihood(replace(self.fitted, late=nothing_late(self.fitted.usual)), held_out)
         return max(likelihood, apart), likelihood > apart
 
@@ -284,4 +288,4 @@ class DecisionGraphModel(GraphPredictions):
             from_arrays({part: state[f"{name}.{part}"] for part in Graphs._fields}, layout, n)
             for name, n in (("usual", now), ("late", both), ("event", now))
         )
-        self.fitted = Fitted(layout, usual, late, event, bool(state["has_event"]), (), ())
+        self.fitted = Fitted(layout, usual, late, event, bool(np.any(state["has_event"])), (), ())

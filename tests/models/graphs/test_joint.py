@@ -127,3 +127,22 @@ def test_the_end_of_an_episode_is_known_by_where_the_step_led() -> None:
     model.fit(dataset(space.cardinalities, 2, states, action, following, row == size - 1))
     drawn, over = model.sample(states, action, derive(2, np.arange(n)))
     np.testing.assert_array_equal(over, drawn.reshape(n, size, size)[:, -1].any(axis=1))
+
+
+def test_states_that_break_a_group_are_put_in_order_by_a_step() -> None:
+    rng, n = np.random.default_rng(0), 1500
+    place, actions = rng.integers(4, size=n), rng.integers(2, size=n)
+    states, following = (np.eye(4, dtype=np.int64)[p] for p in (place, (place + np.where(rng.random(n) < 0.5, 1, actions)) % 4))
+    model = DecisionGraphModel((2,) * 4, 2)
+    model.fit(dataset((2,) * 4, 2, states, actions, following))
+    assert model.fitted.layout.outputs[0] == 4
+    possible, ends = outcomes((2,) * 4)
+    for broken in ([1, 1, 0, 0], [0, 0, 0, 0], [1, 1, 1, 1]):
+        many = np.tile(broken, (len(ends), 1))
+        for action in (0, 1):
+            probs = np.exp(model.log_prob(many, np.full(len(ends), action), possible, ends))
+            assert probs.sum() == pytest.approx(1.0)
+        drawn, over = model.sample(many, np.zeros(len(ends), dtype=np.int64), derive(1, np.arange(len(ends))))
+        assert np.isfinite(model.log_prob(many, np.zeros(len(ends), dtype=np.int64), drawn, over)).all()
+        listed = model.successors(many[:1], np.array([1]), 16, 0)
+        assert (listed.states.sum(axis=1) == 1).all()

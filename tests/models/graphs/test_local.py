@@ -228,3 +228,18 @@ def test_an_empty_history_teaches_nothing() -> None:
     fresh.fit(TransitionDataset((2,) * 9, 2))
     state = np.eye(9, dtype=np.int64)[:1]
     np.testing.assert_array_equal(fresh.sample(state, np.array([1]), derive(1, np.arange(1)))[0], state)
+
+
+def test_lines_that_a_smaller_board_does_not_have_are_left_out() -> None:
+    rng, n, space = np.random.default_rng(0), 4000, planes(1, 8, 4)
+    states = np.zeros((n, 1, 8, 4), dtype=np.int64)
+    following = (rng.random((n, 1, 8, 4)) < 0.5).astype(np.int64)
+    following[:, 0, 3] = np.eye(5, dtype=np.int64)[rng.integers(5, size=n), :4]  # one at most, in row 3 only
+    model = LocalGraphModel(space, 2)
+    model.fit(dataset(space.cardinalities, 2, states.reshape(n, -1), rng.integers(2, size=n), following.reshape(n, -1)))
+    assert any(coupling.line in (3, -5) for coupling in model.local.couplings)
+    smaller = model.for_space(spaces.MultiBinary((1, 3, 4)))
+    drawn, _ = smaller.sample(np.zeros((5, 12), dtype=np.int64), np.zeros(5, dtype=np.int64), derive(1, np.arange(5)))
+    assert drawn.shape == (5, 12)
+    with pytest.raises(ValueError, match="planes of another size"):
+        model.for_space(spaces.Discrete(5))

@@ -1,6 +1,7 @@
 """Rules that change: only what changed is learned anew, and what stays loses nothing."""
 
 import numpy as np
+import pytest
 from gymnasium import spaces
 
 from mbagent.models.graphs import DecisionGraphModel, LocalGraphModel
@@ -55,3 +56,11 @@ def test_the_longest_past_that_still_holds_is_kept() -> None:
     since = still_true_since(rows, 5, model._factors_foretold)
     assert 4000 - 500 <= since[0] <= 6000 - 200 - 250
     assert (since[1:] == 0).all()
+
+
+def test_a_report_after_a_change_holds_out_new_steps_even_of_one_long_episode() -> None:
+    rows = dataset((2,) * 4, 2, *switches(4000, 2500), episode_length=4000)
+    report = DecisionGraphModel((2,) * 4, 2).fit(rows)
+    assert report.log["changed"] == 1
+    assert report.n_validation > 50
+    assert report.predictor_loss == pytest.approx(2 * np.log(2), abs=0.1)
