@@ -22,11 +22,6 @@ def better(logs: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
     return bool(len(gain) > 1 and gain.mean() > 3.0 * gain.std(ddof=1) / np.sqrt(len(gain)))
 
 
-def first_rows(rows: TransitionBatch, most: int) -> TransitionBatch:
-    """The first transitions, in their order."""
-    return rows.select(np.arange(min(len(rows), most)))
-
-
 def thinned(rows: TransitionBatch, most: int) -> TransitionBatch:
     """Evenly chosen transitions."""
     return rows.select(np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)) if len(rows) else rows
@@ -40,13 +35,21 @@ def following_steps(rows: TransitionBatch) -> tuple[NDArray[np.int64], NDArray[n
     return later[same], earlier[same]
 
 
+def steps_in_a_row(rows: TransitionBatch, most: int) -> tuple[TransitionBatch, TransitionBatch]:
+    """Evenly chosen transitions that follow another, and those that they follow."""
+    later, earlier = following_steps(rows)
+    some = np.linspace(0, len(later) - 1, min(len(later), most)).astype(np.int64) if len(later) else later
+    return rows.select(later[some]), rows.select(earlier[some])
+
+
 def with_past(
-    rows: TransitionBatch, cardinalities: tuple[int, ...], n_actions: int, board: PlaneLayout | None
+    now: TransitionBatch, before: TransitionBatch, cardinalities: tuple[int, ...], n_actions: int, board: PlaneLayout | None
 ) -> tuple[FactoredSpace, TransitionBatch]:
-    """The transitions that follow another, with that one's state and action as part of their state.
+    """Transitions that follow others, with the others' states and actions as part of their state.
 
     Args:
-        rows: transitions, consecutive steps together.
+        now: the transitions.
+        before: those that they follow.
         cardinalities: number of values of each factor.
         n_actions: number of actions A.
         board: where the factors are cells of planes; the past is further planes then.
@@ -54,7 +57,6 @@ def with_past(
     Returns:
         (the space of states with a past, the transitions).
     """
-    now, before = (rows.select(which) for which in following_steps(rows))
     shape: tuple[int, ...] = (len(cardinalities),) if board is None else (board.channels, board.height, board.width)
 
     def laid_out(states: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -24,7 +24,7 @@ from mbagent.models.graphs.parents import flat_variables
 from mbagent.models.graphs.predictions import GraphPredictions
 from mbagent.models.graphs.recency import still_true_since
 from mbagent.models.graphs.units import coupled_layout, is_lone_bit, lay_out
-from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, first_rows, following_steps, with_past
+from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, steps_in_a_row, thinned, with_past
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.transitions import TransitionBatch, TransitionDataset
 
@@ -127,24 +127,23 @@ class DecisionGraphModel(GraphPredictions):
 
     def _described(self, held_out: TransitionBatch) -> tuple[tuple[VariableReport, ...], float | None]:
         """Figures of each variable on some held-out transitions."""
-        some = first_rows(held_out, DESCRIBED)
+        some = thinned(held_out, DESCRIBED)
         return describe(self.cardinalities, self.marginals(some.states, some.actions), some, self._variables())
 
     def _variables(self) -> list[Variable]:
         """What is reported of."""
         return flat_variables(self.fitted.layout, self.fitted.usual, self.fitted.late)
 
-    def _memory(self, train: TransitionBatch, held_out: TransitionBatch) -> float:
+    def _memory(self, train: TransitionBatch, held_out: TransitionBatch) -> float | None:
         """What the step before tells beyond the present, nats a transition; see FitReport."""
-        some, tests = first_rows(train, SOME_ROWS), first_rows(held_out, SOME_TESTS)
-        later, known = tests.select(following_steps(tests)[0]), some.select(following_steps(some)[0])
-        if min(len(later), len(known)) < 2:
-            return 0.0
-        logs = self._foretold(known, later)
+        known, tests = steps_in_a_row(train, SOME_ROWS), steps_in_a_row(held_out, SOME_TESTS)
+        if min(len(known[0]), len(tests[0])) < 2:
+            return None
+        logs = self._foretold(known[0], tests[0])
         if logs.mean() > FORETOLD:
             return 0.0
-        space, longer = with_past(some, self.cardinalities, self.n_actions, self._planes())
-        _, longer_tests = with_past(tests, self.cardinalities, self.n_actions, self._planes())
+        space, longer = with_past(*known, self.cardinalities, self.n_actions, self._planes())
+        _, longer_tests = with_past(*tests, self.cardinalities, self.n_actions, self._planes())
         further = self._with_memory(space)._foretold(longer, longer_tests)
         gain = float((further - logs).mean())
         return gain if better(further, logs) and gain > WORTH * (1.0 - logs.mean()) else 0.0
