@@ -269,9 +269,11 @@ def distributions(
     for unit in units:
         first, n, start = layout.first[unit], layout.outputs[unit], graphs.start[unit]
         value = state[layout.members[first]] if layout.first[unit + 1] == first + 1 else 0
-        for member in range(first + 1, layout.first[unit + 1]):
-            if state[layout.members[member]] == 1:
-                value = member - first
+        if layout.first[unit + 1] > first + 1:
+            for member in range(first, layout.first[unit + 1]):
+                if state[layout.members[member]] == 1:
+                    value = member - first
+                    break
         values[unit] = value
         pair = graphs.pairs[unit] + action * n + value
         total, slack = 0.0, 0.0

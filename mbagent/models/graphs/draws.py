@@ -173,7 +173,7 @@ def _draw(unit: int, u: float, w: Work, layout: Layout, graphs: Graphs, followin
     chosen = _pick(w.rates, graphs.start[unit], layout.outputs[unit], u, w.values[unit])
     if unit == len(layout.outputs) - 2:
         terminated[b] = chosen == 1
-    elif chosen != w.values[unit] or layout.first[unit + 1] > layout.first[unit] + 1:
+    elif chosen != w.values[unit]:
         write(following, unit, chosen, layout)
 
 
@@ -200,7 +200,7 @@ def log_prob(
             then = int(terminated[b]) if unit == n_units - 2 else read(following[b], int(unit), layout)
             p = w.rates[graphs.start[unit] + then]
             result[b] += math.log(p) if p > 0.0 else -math.inf
-            if unit < n_units - 2:
+            if unit < n_units - 2 and then != w.values[unit]:
                 write(other, int(unit), then, layout)
         for q in range(len(layout.exactly)):
             couple(q, states[b], w.rates, w.still, layout, graphs, w.joint)

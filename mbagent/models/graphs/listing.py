@@ -63,8 +63,7 @@ def _distribution(number: int, state: Ints, layout: Layout, graphs: Graphs, w: W
         return couple(number - n_units, state, w.rates, w.still, layout, graphs, w.joint) + 1, -1
     n, start = layout.outputs[number], graphs.start[number]
     w.joint[:n] = w.rates[start : start + n]
-    lone = layout.first[number + 1] <= layout.first[number] + 1
-    return n, w.values[number] if lone else -1
+    return n, w.values[number]
 
 
 @compiled

@@ -31,6 +31,9 @@ from mbagent.transitions import TransitionBatch, TransitionDataset
 IMPOSSIBLE = -200.0
 """Log-probability that an impossible transition is charged with when models are compared."""
 
+FEWEST = 4
+"""Rare events that there must be to learn anything of them."""
+
 ENOUGH, MOST_SPLITS = 5, 10
 """So many held-out rare events tell whether they are events at all; where one split has fewer, others follow, up to so many."""
 
@@ -198,7 +201,7 @@ class DecisionGraphModel(GraphPredictions):
         """Which rows are rare events; none if held-out transitions are foretold better without."""
         rows = data.rows()
         events, gain, tested = flag_events(rows.states, rows.next_states), 0.0, 0
-        for split in range(MOST_SPLITS if events.any() else 0):
+        for split in range(MOST_SPLITS if events.sum() >= FEWEST else 0):
             train, held_out = data.split(self.validation, seed + split)
             seen = flag_events(train.states, train.next_states)
             with_events, without = (

@@ -46,17 +46,25 @@ def still_true_since(rows: TransitionBatch, n_variables: int, foretell: Foretell
     tests, thinned = rows.select(np.arange(n_old, len(rows))), np.linspace(0, n_old - 1, min(n_old, MOST_ROWS))
     everything = foretell(rows.select(thinned.astype(np.int64)), tests)
     best, best_mean = since.copy(), everything.mean(axis=0)
+    best_logs = everything.copy()
     changed, length, tried = np.zeros(n_variables, dtype=np.bool_), LEAST, 0
     while 1.5 * length < n_old and (tried < 2 or changed.any()):
         first = n_old - length
         some = np.linspace(first, n_old - 1, min(length, MOST_ROWS)).astype(np.int64)
         recent = foretell(rows.select(some), tests)
-        gain = recent - everything
-        error = gain.std(axis=0, ddof=1) / np.sqrt(len(tests))
-        limit = (3.0 + np.sqrt(2.0 * np.log(n_variables))) * error
-        changed |= (gain.mean(axis=0) > limit) & (gain.mean(axis=0) > NOTICEABLE)
+        changed |= _gained(recent - everything)
         better = changed & (recent.mean(axis=0) > best_mean)
-        best[better], best_mean[better] = first, recent.mean(axis=0)[better]
+        best[better], best_mean[better], best_logs[:, better] = first, recent.mean(axis=0)[better], recent[:, better]
         length, tried = 2 * length, tried + 1
+    if changed.any() and n_old > MOST_ROWS:  # what a part of the past cannot foretell, all of it perhaps can
+        changed &= _gained(best_logs - foretell(rows.select(np.arange(n_old)), tests))
     since[changed] = best[changed]
     return since
+
+
+def _gained(gain: Floats) -> NDArray[np.bool_]:
+    """Of which variables the gains [T, V] are more than chance, and noticeable."""
+    error = gain.std(axis=0, ddof=1) / np.sqrt(len(gain))
+    limit = (3.0 + np.sqrt(2.0 * np.log(gain.shape[1]))) * error
+    result: NDArray[np.bool_] = (gain.mean(axis=0) > limit) & (gain.mean(axis=0) > NOTICEABLE)
+    return result

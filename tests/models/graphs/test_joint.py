@@ -129,7 +129,7 @@ def test_the_end_of_an_episode_is_known_by_where_the_step_led() -> None:
     np.testing.assert_array_equal(over, drawn.reshape(n, size, size)[:, -1].any(axis=1))
 
 
-def test_states_that_break_a_group_are_put_in_order_by_a_step() -> None:
+def test_states_that_break_a_group_have_probabilities_too() -> None:
     rng, n = np.random.default_rng(0), 1500
     place, actions = rng.integers(4, size=n), rng.integers(2, size=n)
     states, following = (np.eye(4, dtype=np.int64)[p] for p in (place, (place + np.where(rng.random(n) < 0.5, 1, actions)) % 4))
@@ -145,4 +145,6 @@ def test_states_that_break_a_group_are_put_in_order_by_a_step() -> None:
         drawn, over = model.sample(many, np.zeros(len(ends), dtype=np.int64), derive(1, np.arange(len(ends))))
         assert np.isfinite(model.log_prob(many, np.zeros(len(ends), dtype=np.int64), drawn, over)).all()
         listed = model.successors(many[:1], np.array([1]), 16, 0)
-        assert (listed.states.sum(axis=1) == 1).all()
+        ones = np.ones(len(listed.states), dtype=np.int64)
+        logs = model.log_prob(np.tile(broken, (len(ones), 1)), ones, listed.states, listed.terminated)
+        np.testing.assert_allclose(np.exp(logs), listed.probabilities, atol=0.01)
