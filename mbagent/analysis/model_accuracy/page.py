@@ -10,6 +10,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
 
 from mbagent.analysis.model_accuracy.studies import STUDIES
 from mbagent.analysis.pages import FIGURE_STYLE, format_number, render, to_png
@@ -99,6 +100,9 @@ def draw_cost(rows: Sequence[Row]) -> bytes:
             d, times = (np.array([row[key] for row in rows], dtype=np.float64) for key in ("d", name))
             axes.loglog(d, times, "o-", color="#00798c")
             axes.loglog(d, times[0] * (d / d[0]) ** 1.2, "--", color="#9aa3ad", label="d to the power of 1.2")
+            axes.xaxis.set_major_locator(FixedLocator(list(d)))
+            axes.xaxis.set_major_formatter(ScalarFormatter())
+            axes.xaxis.set_minor_formatter(NullFormatter())
             axes.set_title(f"{name}: exponent {slope(rows, name):.2f}", loc="left")
             axes.set_xlabel("variables d")
             axes.legend(frameon=False)
@@ -111,7 +115,7 @@ def draw_trust(rows: Sequence[Row]) -> bytes:
         figure = Figure(figsize=(4.4, 3.6), layout="constrained")
         axes: Axes = figure.subplots()
         for name in dict.fromkeys(row["world"] for row in rows):
-            mine = sorted((row["estimate"], row["rate"]) for row in rows if row["world"] == name)
+            mine = sorted((row["estimate"], row["rate"]) for row in rows if row["world"] == name and row["bin"] != "all")
             axes.plot(*zip(*mine, strict=True), "o-", label=name, markersize=4)
         axes.plot([0, 1], [0, 1], "--", color="#9aa3ad")
         axes.set_xlabel("estimated probability of a wrong prediction")

@@ -21,6 +21,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from mbagent.agent import ModelLearningAgent
+from mbagent.analysis.cases import find_case, measure_scale
 from mbagent.analysis.model_accuracy.changed import CHANGES
 from mbagent.analysis.model_accuracy.experiment import CASES, LEARNING_RATE, certain_factors, random_play
 from mbagent.analysis.model_accuracy.minatar import minatar
@@ -39,9 +40,6 @@ Ints: TypeAlias = NDArray[np.int64]
 Row: TypeAlias = dict[str, Any]
 NAN = float("nan")
 N_TESTS = 20_000
-
-REFERENCE, RANDOM = 18.9, 1.1
-"""Returns of shortest paths and of random play on Maneuverer."""
 
 
 def learned(space: FactoredSpace, n_actions: int, *parts: TransitionBatch, name: str = "auto") -> TransitionModel:
@@ -74,7 +72,7 @@ def changes(seed: int, full: bool) -> list[Row]:
         old = random_play(before, 10_000, seed, order)
         tests = random_play(after, N_TESTS, seed + 10_000, order)
         certain = certain_factors(SimulatorModel(after), tests, order, seed)
-        for steps in (300, 500, 1000, 2000) if full else (500, 1000):
+        for steps in (100, 200, 300, 500, 700, 1000) if full else (100, 300, 500, 1000):
             new = random_play(after, steps, seed + 1, order)
             continued, fresh = learned(space, n_actions, old, new), learned(space, n_actions, new)
             figures = {"continued": exact(continued, tests, certain), "from scratch": exact(fresh, tests, certain)}
@@ -193,15 +191,18 @@ def trust(seed: int, full: bool) -> list[Row]:
         error = estimate_error(partial(build_model, "auto", space, n_actions, LEARNING_RATE), model, data, seed=seed)
         tests = random_play(game, N_TESTS, seed + 10_000, order)
         estimated, wrong = error(tests.states, tests.actions), missed(model, tests)
-        summary = {"estimated": float(estimated.mean()), "wrong": float(wrong.mean()), "area under curve": area(estimated, wrong)}
-        summary["rank correlation"] = float(spearmanr(estimated, wrong).statistic) if wrong.any() else NAN
+        label: Row = {"world": name, "steps": steps}
+        ranks = {"area under curve": area(estimated, wrong), "rank correlation": NAN}
+        if wrong.any():
+            ranks["rank correlation"] = float(spearmanr(estimated, wrong).statistic)
         edges = np.array([0.0, 0.003, 0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0 + 1e-9])
-        for low, high in itertools.pairwise(edges):
-            inside = (estimated >= low) & (estimated < high)
+        bins = [("all", np.ones(len(wrong), dtype=np.bool_))]
+        bins += [(f"from {low:g}", (estimated >= low) & (estimated < high)) for low, high in itertools.pairwise(edges)]
+        for part, inside in bins:
             if inside.sum() >= 20:
                 means = {"estimate": float(estimated[inside].mean()), "rate": float(wrong[inside].mean())}
-                label = {"world": name, "steps": steps, "bin": f"from {low:g}"}
-                rows.append({**label, **summary, "in bin": int(inside.sum()), **means})
+                whole = ranks if part == "all" else dict.fromkeys(ranks, NAN)
+                rows.append({**label, "bin": part, "in bin": int(inside.sum()), **means, **whole})
     return rows
 
 
@@ -232,7 +233,8 @@ def agents(seed: int, full: bool) -> list[Row]:
     ours, began = time.process_time() - began, time.process_time()
     PPO("MlpPolicy", gym.make("mbagent/Maneuverer-v0"), seed=seed, device="cpu").learn(100_000)
     seconds = {"20,000 steps, s": ours, "PPO 100,000 steps, s": time.process_time() - began}
-    gap = (returns["learned"] - returns["true"]) / (REFERENCE - RANDOM)
+    scale = measure_scale(find_case("maneuverer"))
+    gap = (returns["learned"] - returns["true"]) / (scale.reference - scale.random)
     return [{"game": "Maneuverer", **returns, "learned - true, normalised": gap, **seconds}]
 
 

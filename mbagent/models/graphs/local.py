@@ -161,7 +161,7 @@ class LocalGraphModel(DecisionGraphModel):
         graphs, asked, found = learn_channels(planes)
         self.local = replace(local, graphs=graphs, late=nothing_late(graphs), couplings=())
         self._instantiate((), ())
-        some = rows.select(np.linspace(0, len(rows) - 1, min(len(rows), 4000)).astype(np.int64)) if len(rows) else rows
+        some = thinned(rows, SOME_ROWS)
         couplings = find_couplings(rows, self.board, local.cardinalities, some, self._ones(some))
         self.local = replace(self.local, couplings=couplings)
         layout = with_couplings(self.fitted.layout, couplings)

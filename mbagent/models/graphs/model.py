@@ -185,15 +185,16 @@ class DecisionGraphModel(GraphPredictions):
         return max(likelihood, apart), likelihood > apart
 
     def _report(self, sizes: tuple[int, int], likelihood: float, exact: float, figures: Mapping[str, float]) -> FitReport:
-        """What a fit did; ``sizes`` are the rows fitted to and held out."""
+        """What a fit did; ``sizes`` are the rows fitted to and held out. Of nothing held out nothing is claimed."""
+        held_out = sizes[1] > 0
         splits = [sum(split.column >= 0 for split in search.splits) for search in self.fitted.found]
         return FitReport(
             n_train=sizes[0],
             n_validation=sizes[1],
             epochs=1,
             seconds=0.0,
-            predictor_loss=-likelihood,
-            exact_match=exact,
+            predictor_loss=-likelihood if held_out else None,
+            exact_match=exact if held_out else None,
             log={"questions": float(len(splits)), "splits": float(np.mean(splits)) if splits else 0.0, **figures},
         )
 

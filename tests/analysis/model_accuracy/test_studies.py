@@ -76,7 +76,7 @@ def test_the_page_holds_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "geysers in the opposite order" in text
     assert (tmp_path / "changes.png").read_bytes().startswith(b"\x89PNG")
-    assert len((tmp_path / "changes.csv").read_text(encoding="utf-8").splitlines()) == 3
+    assert len((tmp_path / "changes.csv").read_text(encoding="utf-8").splitlines()) == 5
     cost = [{"d": d, "size": d, "fit seconds": 1.0 * d, "sample microseconds": 1.0 * d} for d in (48, 192)]
     trust = [{"world": "w", "steps": 1, "bin": str(p), "estimate": p, "rate": p} for p in (0.1, 0.9)]
     pictures = write_page(tmp_path / "other.html", {"cost": cost, "trust": trust}, [], "a command")
