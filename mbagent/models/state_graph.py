@@ -7,29 +7,181 @@ depend on which other observations are planned for in the same batch.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.base import Bools, Floats, States, Successors, TransitionModel, hash_rows
-from mbagent_envs.random_keys import derive
+from mbagent.models.base import Bools, Floats, Keys, States, Successors, TransitionModel
+from mbagent.models.compiled_model import CompiledModel, Outcomes, outcomes, work_for
+from mbagent.models.particles import start as grid_of
+from mbagent_envs._compiled import borrowed, compiled
+from mbagent_envs.random_keys import derive, mix
 
-Indices = NDArray[np.int64]
+Indices: TypeAlias = NDArray[np.int64]
+
+FEWEST_SLOTS = 1024
+"""Places of the smallest hash table."""
 
 
 class GraphArrays(NamedTuple):
-    """What compiled kernels need of a graph; shapes and meanings as in StateGraph."""
+    """What compiled kernels need of a graph, with room to grow; N nodes and M edges of them are in use.
 
+    Attributes:
+        states, groups, expanded, first, counts: see StateGraph, [room, ...].
+        reached: whether a node was reached by a transition that did not end the episode, bool [room].
+        tags: hash of each node's state and group, uint64 [room].
+        next_nodes, probabilities, terminated, sources, actions: see StateGraph, [room].
+        slots: hash table of the nodes, -1 where free, int64 [a power of two].
+        weights: of the hash, uint64 [F].
+        sizes: N and M, int64 [2].
+    """
+
+    states: States
     groups: Indices
     expanded: Bools
     first: Indices
     counts: Indices
+    reached: Bools
+    tags: Keys
     next_nodes: Indices
     probabilities: Floats
     terminated: Bools
     sources: Indices
     actions: Indices
+    slots: Indices
+    weights: Keys
+    sizes: Indices
+
+
+@compiled
+def add_node(graph: GraphArrays, state: Indices, group: int) -> int:
+    """The node of a state [F] in a group; a new one where there is none. There must be room."""
+    total = np.uint64(0)
+    for f in range(len(state)):
+        total += np.uint64(state[f] + 1) * graph.weights[f]
+    tag, slots, sizes = mix(total ^ mix(np.uint64(group))), graph.slots, graph.sizes
+    place = np.int64(tag & np.uint64(len(slots) - 1))
+    while slots[place] >= 0:
+        if graph.tags[slots[place]] == tag:
+            return int(slots[place])
+        place = (place + 1) & (len(slots) - 1)
+    node = sizes[0]
+    slots[place] = node
+    graph.tags[node] = tag
+    graph.groups[node] = group
+    graph.expanded[node], graph.reached[node] = False, False
+    for f in range(len(state)):
+        graph.states[node, f] = state[f]
+    for a in range(graph.counts.shape[1]):
+        graph.first[node, a], graph.counts[node, a] = 0, 0
+    sizes[0] = node + 1
+    return int(node)
+
+
+@compiled
+def add_edge(graph: GraphArrays, source: int, action: int, state: Indices, terminated: bool, probability: float) -> int:
+    """Appends a successor of a (node, action), whose others were the last to be appended; returns its node."""
+    target, edge = add_node(graph, state, graph.groups[source]), graph.sizes[1]
+    graph.next_nodes[edge], graph.probabilities[edge], graph.terminated[edge] = target, probability, terminated
+    graph.sources[edge], graph.actions[edge] = source, action
+    if graph.counts[source, action] == 0:
+        graph.first[source, action] = edge
+    graph.counts[source, action] += 1
+    graph.reached[target] |= not terminated
+    graph.sizes[1] = edge + 1
+    return target
+
+
+@compiled
+def expand_with(
+    kernel: Any, work: Any, graph: GraphArrays, node: int, n_samples: int, key: np.uint64, offset: float, out: Outcomes
+) -> None:
+    """Appends all successors of a node, from a kernel."""
+    outcomes(kernel, work, graph.states[node], n_samples, key, offset, out)
+    i = 0
+    for action in range(len(out.counts)):
+        for _ in range(out.counts[action]):
+            add_edge(graph, node, action, out.states[i], out.terminated[i], out.probabilities[i])
+            i += 1
+    graph.expanded[node] = True
+
+
+@compiled
+def room_for_outcomes(n_actions: int, n_factors: int, n_samples: int) -> Outcomes:
+    """Room for all that may follow a state."""
+    most = 2 * n_actions * n_samples
+    return Outcomes(
+        np.empty(n_actions, dtype=np.int64),
+        np.empty((most, n_factors), dtype=np.int64),
+        np.empty(most, dtype=np.bool_),
+        np.empty(most, dtype=np.float64),
+    )
+
+
+@compiled
+def _expand_all(kernel: Any, graph: GraphArrays, nodes: Indices, n_samples: int, key: np.uint64, offset: float) -> int:
+    """Expands nodes [B] as long as there is room; returns how many."""
+    n_actions, most = graph.counts.shape[1], 2 * n_samples * graph.counts.shape[1]
+    made = work_for(kernel, n_samples), room_for_outcomes(n_actions, graph.states.shape[1], n_samples)
+    lent, kernel, graph = borrowed(made), borrowed(kernel), borrowed(graph)
+    done = 0
+    for node in nodes:
+        if graph.sizes[0] + most > len(graph.states) or graph.sizes[1] + most > len(graph.sources):
+            break
+        expand_with(kernel, lent[0], graph, node, n_samples, key, offset, lent[1])
+        done += 1
+    return done + 0 * len(made[1].counts)  # what is lent must live until here
+
+
+@compiled
+def _append(
+    graph: GraphArrays, nodes: Indices, offsets: Indices, states: States, terminated: Bools, probabilities: Floats
+) -> None:
+    """Appends successors that a model found: those of nodes[i] under action a are row i * A + a of the compressed rows."""
+    n_actions = graph.counts.shape[1]
+    for i in range(len(nodes)):
+        for a in range(n_actions):
+            for e in range(offsets[i * n_actions + a], offsets[i * n_actions + a + 1]):
+                add_edge(graph, nodes[i], a, states[e], terminated[e], probabilities[e])
+        graph.expanded[nodes[i]] = True
+
+
+@compiled
+def _add_all(graph: GraphArrays, states: States, groups: Indices, nodes: Indices) -> None:
+    for b in range(len(states)):
+        nodes[b] = add_node(graph, states[b], groups[b])
+
+
+@compiled
+def _find_all(graph: GraphArrays, states: States, group: int, nodes: Indices) -> None:
+    slots = graph.slots
+    for b in range(len(states)):
+        total = np.uint64(0)
+        for f in range(states.shape[1]):
+            total += np.uint64(states[b, f] + 1) * graph.weights[f]
+        tag = mix(total ^ mix(np.uint64(group)))
+        place = np.int64(tag & np.uint64(len(slots) - 1))
+        nodes[b] = -1
+        while slots[place] >= 0:
+            if graph.tags[slots[place]] == tag:
+                nodes[b] = slots[place]
+                break
+            place = (place + 1) & (len(slots) - 1)
+
+
+@compiled
+def _place_all(tags: Keys, slots: Indices) -> None:
+    """Fills an empty hash table."""
+    for node in range(len(tags)):
+        place = np.int64(tags[node] & np.uint64(len(slots) - 1))
+        while slots[place] >= 0:
+            place = (place + 1) & (len(slots) - 1)
+        slots[place] = node
+
+
+_NODE_FIELDS = ("states", "groups", "expanded", "first", "counts", "reached", "tags")
+_EDGE_FIELDS = ("next_nodes", "probabilities", "terminated", "sources", "actions")
 
 
 class StateGraph:
@@ -46,43 +198,39 @@ class StateGraph:
         first, counts: int64 [N, A].
         next_nodes: int64 [M]. probabilities: float64 [M]. terminated: bool [M].
         sources: int64 [M], the node each successor comes from. actions: int64 [M].
+        arrays: the same for compiled kernels, with room to grow.
+        kernel: the model's arrays for compiled kernels; None where it has none.
     """
 
     def __init__(self, model: TransitionModel) -> None:
         """See the class."""
         self.model = model
+        self.kernel = model.kernel() if isinstance(model, CompiledModel) else None
         n_factors, n_actions = len(model.cardinalities), model.n_actions
-        self._index: dict[int, int] = {}
-        self._nodes = _Table(
-            states=np.zeros((0, n_factors), dtype=np.int64),
-            groups=np.zeros(0, dtype=np.int64),
-            expanded=np.zeros(0, dtype=np.bool_),
-            first=np.zeros((0, n_actions), dtype=np.int64),
-            counts=np.zeros((0, n_actions), dtype=np.int64),
-        )
-        self._edges = _Table(
-            next_nodes=np.zeros(0, dtype=np.int64),
-            probabilities=np.zeros(0, dtype=np.float64),
-            terminated=np.zeros(0, dtype=np.bool_),
-            sources=np.zeros(0, dtype=np.int64),
-            actions=np.zeros(0, dtype=np.int64),
-        )
+        none = np.zeros(0, dtype=np.int64)
+        table, flags = np.zeros((0, n_actions), dtype=np.int64), np.zeros(0, dtype=np.bool_)
+        self.arrays = GraphArrays(
+            np.zeros((0, n_factors), dtype=np.int64), none, flags, table, table, flags, none.astype(np.uint64),
+            none, none.astype(np.float64), flags, none, none,
+            np.full(FEWEST_SLOTS, -1, dtype=np.int64),
+            derive(np.arange(n_factors, dtype=np.uint64), 0x5851F42D) | np.uint64(1),
+            np.zeros(2, dtype=np.int64),
+        )  # fmt: skip
 
     def __len__(self) -> int:
         """Number of nodes N."""
-        return self._nodes.size
+        return int(self.arrays.sizes[0])
 
     @property
     def n_edges(self) -> int:
         """Number of successors M."""
-        return self._edges.size
+        return int(self.arrays.sizes[1])
 
-    def __getattr__(self, name: str) -> NDArray[np.generic]:
-        """The filled part of the array ``name``."""
-        for table in (self.__dict__.get("_nodes"), self.__dict__.get("_edges")):
-            if table is not None and name in table.arrays:
-                view: NDArray[np.generic] = table.view(name)
-                return view
+    def __getattr__(self, name: str) -> NDArray[Any]:
+        """Views of the arrays that are filled so far."""
+        if name in _NODE_FIELDS or name in _EDGE_FIELDS:
+            array: NDArray[Any] = getattr(self.arrays, name)
+            return array[: self.arrays.sizes[0 if name in _NODE_FIELDS else 1]]
         raise AttributeError(name)
 
     states: States
@@ -96,39 +244,37 @@ class StateGraph:
     sources: Indices
     actions: Indices
 
-    @property
-    def arrays(self) -> GraphArrays:
-        """Views of what is filled so far."""
-        return GraphArrays(*(getattr(self, name) for name in GraphArrays._fields))
+    def clear(self) -> None:
+        """Forgets all states; the room stays."""
+        self.arrays.slots.fill(-1)
+        self.arrays.sizes.fill(0)
+
+    def reserve(self, n_nodes: int, n_edges: int) -> None:
+        """Makes room for so many more nodes and edges."""
+        arrays = self.arrays
+        for extra, fields, used in ((n_nodes, _NODE_FIELDS, len(self)), (n_edges, _EDGE_FIELDS, self.n_edges)):
+            old = len(getattr(arrays, fields[0]))
+            if used + extra > old:
+                size = max(used + extra, 2 * old, 1024)
+                arrays = arrays._replace(**{name: _longer(getattr(arrays, name), size) for name in fields})
+        if 2 * len(arrays.tags) > len(arrays.slots):
+            slots = np.full(1 << (2 * len(arrays.tags) - 1).bit_length(), -1, dtype=np.int64)
+            _place_all(arrays.tags[: len(self)], slots)
+            arrays = arrays._replace(slots=slots)
+        self.arrays = arrays
 
     def add(self, states: States, groups: Indices) -> Indices:
         """Nodes [B] of the given states [B, F] in the given groups [B]; new ones are appended in order of appearance."""
-        tags = derive(hash_rows(states), groups)
-        _, first, inverse = np.unique(tags, return_index=True, return_inverse=True)
-        order = np.argsort(first, kind="stable")
-        nodes = np.empty(len(first), dtype=np.int64)
-        fresh: list[int] = []
-        size = len(self)
-        for unique in order:
-            tag = int(tags[first[unique]])
-            node = self._index.get(tag)
-            if node is None:
-                node = size + len(fresh)
-                self._index[tag] = node
-                fresh.append(first[unique])
-            nodes[unique] = node
-        if fresh:
-            self._nodes.append(
-                len(fresh),
-                states=states[fresh],
-                groups=groups[fresh],
-            )
-        return nodes[inverse]
+        self.reserve(len(states), 0)
+        nodes = np.empty(len(states), dtype=np.int64)
+        _add_all(self.arrays, np.ascontiguousarray(states, dtype=np.int64), groups, nodes)
+        return nodes
 
     def find(self, states: States, group: int = 0) -> Indices:
         """Nodes [B] of states [B, F] in one group, -1 where there is none."""
-        tags = derive(hash_rows(states), np.full(len(states), group))
-        return np.array([self._index.get(int(tag), -1) for tag in tags], dtype=np.int64)
+        nodes = np.empty(len(states), dtype=np.int64)
+        _find_all(self.arrays, np.ascontiguousarray(states, dtype=np.int64), group, nodes)
+        return nodes
 
     def expand(self, nodes: Indices, n_samples: int, seed: int) -> Indices:
         """Asks the model for the successors of unexpanded, distinct ``nodes`` [B] under every action.
@@ -136,55 +282,32 @@ class StateGraph:
         Returns:
             the nodes that were new, in order of appearance, int64.
         """
-        if len(nodes) == 0:
-            return np.zeros(0, dtype=np.int64)
-        n_actions = self.model.n_actions
-        sources = np.repeat(nodes, n_actions)
-        actions = np.tile(np.arange(n_actions), len(nodes))
-        found = self.model.successors(self.states[sources], actions, n_samples, seed)
-        return self._append(nodes, sources, actions, found)
-
-    def _append(self, nodes: Indices, sources: Indices, actions: Indices, found: Successors) -> Indices:
-        rows, size, start = found.rows, len(self), self.n_edges
-        next_nodes = self.add(found.states, self.groups[sources[rows]])
-        self._edges.append(
-            len(rows),
-            next_nodes=next_nodes,
-            probabilities=found.probabilities,
-            terminated=found.terminated,
-            sources=sources[rows],
-            actions=actions[rows],
-        )
-        shape = (len(nodes), self.model.n_actions)
-        self.first[nodes] = start + found.offsets[:-1].reshape(shape)
-        self.counts[nodes] = np.diff(found.offsets).reshape(shape)
-        self.expanded[nodes] = True
+        size = len(self)
+        if self.kernel is not None:
+            key, offset = grid_of(seed)
+            while len(nodes):
+                most = 2 * n_samples * self.model.n_actions * min(len(nodes), 64)
+                self.reserve(most, most)
+                nodes = nodes[_expand_all(self.kernel, self.arrays, nodes, n_samples, key, offset) :]
+        elif len(nodes):
+            n_actions = self.model.n_actions
+            sources, actions = np.repeat(nodes, n_actions), np.tile(np.arange(n_actions), len(nodes))
+            self._append(nodes, self.model.successors(self.states[sources], actions, n_samples, seed))
         return np.arange(size, len(self), dtype=np.int64)
 
+    def _append(self, nodes: Indices, found: Successors) -> None:
+        self.reserve(len(found.states), len(found.states))
+        states = np.ascontiguousarray(found.states, dtype=np.int64)
+        _append(self.arrays, nodes, found.offsets, states, found.terminated, found.probabilities)
+
     def only_terminal(self, nodes: Indices) -> Bools:
-        """Whether each of the new ``nodes`` [B] was reached by terminated transitions only: nothing comes after it."""
-        alive = np.zeros(len(self), dtype=np.bool_)
-        alive[self.next_nodes[~self.terminated]] = True
-        return ~alive[nodes]
+        """Whether each of the ``nodes`` [B] was reached by terminated transitions only: nothing comes after it."""
+        result: Bools = ~self.arrays.reached[nodes]
+        return result
 
 
-class _Table:
-    """Arrays that grow together by doubling."""
-
-    def __init__(self, **arrays: NDArray[np.generic]) -> None:
-        self.arrays = arrays
-        self.size = 0
-
-    def view(self, name: str) -> NDArray[np.generic]:
-        return self.arrays[name][: self.size]
-
-    def append(self, n: int, **rows: NDArray[np.generic]) -> None:
-        """Appends n rows; arrays not named are filled with zeros."""
-        capacity = len(next(iter(self.arrays.values())))
-        if self.size + n > capacity:
-            more = max(1024, capacity, n)
-            for name, array in self.arrays.items():
-                self.arrays[name] = np.concatenate([array, np.zeros((more, *array.shape[1:]), dtype=array.dtype)])
-        for name, values in rows.items():
-            self.arrays[name][self.size : self.size + n] = values
-        self.size += n
+def _longer(array: NDArray[Any], size: int) -> NDArray[Any]:
+    """The array with room for ``size`` rows."""
+    longer = np.empty((size, *array.shape[1:]), dtype=array.dtype)
+    longer[: len(array)] = array
+    return longer

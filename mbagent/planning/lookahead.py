@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.state_graph import StateGraph
+from mbagent.planning.growing import grow_around
 from mbagent_envs.random_keys import derive
 
 LAYER_WIDTH = 32
@@ -37,6 +38,9 @@ def grow_lookahead(graph: StateGraph, roots: NDArray[np.int64], max_states: int,
         horizon: steps from the root, at most.
         seed: which random numbers.
     """
+    if graph.kernel is not None:
+        _grow_compiled(graph, roots, max_states, n_samples, horizon, seed)
+        return
     budget = np.full(len(roots), max_states, dtype=np.int64)
     reach, depth = np.zeros(len(graph)), np.zeros(len(graph), dtype=np.int64)
     reach[roots] = 1.0
@@ -103,3 +107,16 @@ def place_in_group(groups: NDArray[np.int64]) -> NDArray[np.int64]:
     place = np.empty_like(groups)
     place[order] = np.arange(len(groups)) - np.repeat(starts, lengths)
     return place
+
+
+def _grow_compiled(graph: StateGraph, roots: NDArray[np.int64], max_states: int, n_samples: int, horizon: int, seed: int) -> None:
+    """The same with a model that compiled code can ask: one root after the other."""
+    n_actions = graph.model.n_actions
+    for root in roots:
+        budget, begin = max_states, len(graph)
+        reach, depth = np.zeros(0), np.zeros(0, dtype=np.int64)
+        while budget > 0:
+            most = 2 * n_samples * n_actions * min(budget, 64)
+            graph.reserve(most, most)
+            reach, depth = np.resize(reach, len(graph.arrays.tags)), np.resize(depth, len(graph.arrays.tags))
+            budget = grow_around(graph.kernel, graph.arrays, root, begin, budget, n_samples, horizon, seed, reach, depth)

@@ -176,8 +176,8 @@ def break_ties(graph: StateGraph, q: Floats, roots: Indices, gamma: float) -> Fl
 @compiled
 def _lead_to_news(graph: GraphArrays, q: Floats, tie: float, gamma: float, max_sweeps: int, news: Floats) -> None:
     """Fills ``news`` [N, A]: discounted probability of an unexpanded state, by behaviour that is best under ``q``."""
-    w = np.where(graph.expanded, 0.0, 1.0)
-    active = np.ones(graph.groups.max() + 1, dtype=np.bool_)
+    w = np.where(graph.expanded[: len(q)], 0.0, 1.0)
+    active = np.ones(graph.groups[: len(q)].max() + 1, dtype=np.bool_)
     for _ in range(max_sweeps):
         moved = np.zeros(len(active))
         for s in range(len(q) - 1, -1, -1):

@@ -213,11 +213,12 @@ def show(state: Ints, action: int, layout: Layout, on: Bools) -> None:
         on[n + other] = other == action
     n += layout.n_actions
     for m in range(len(layout.meetings)):
-        on[n + m] = _meets(state, layout.cells, layout.meetings[m])
+        on[n + m] = meets(state, layout.cells, layout.meetings[m])
 
 
 @compiled
-def _meets(state: Ints, cells: Ints, meeting: Ints) -> bool:
+def meets(state: Ints, cells: Ints, meeting: Ints) -> bool:
+    """Whether a meeting (see ``units.Layout``) takes place in a state [F]."""
     _, height, width = cells.shape
     below, right = meeting[4], meeting[5]
     for y in range(height):
@@ -253,7 +254,7 @@ def show_next_meetings(following: Ints, layout: Layout, on: Bools) -> None:
     """Writes what meets what in a next state [F], after all other columns."""
     n = n_columns(layout) + len(layout.factor)
     for m in range(len(layout.next_meetings)):
-        on[n + m] = _meets(following, layout.cells, layout.next_meetings[m])
+        on[n + m] = meets(following, layout.cells, layout.next_meetings[m])
 
 
 @compiled

@@ -18,7 +18,9 @@ from mbagent.models.base import (
 from mbagent.models.graphs import draws
 from mbagent.models.graphs.compiled import Graphs
 from mbagent.models.graphs.fitting import Fitted, nothing_late
+from mbagent.models.graphs.lean import Lean
 from mbagent.models.graphs.listing import mixed, successors
+from mbagent.models.graphs.whole import WholeKernel, kernel_of
 from mbagent.models.particles import assemble, rows_at_once, start
 from mbagent_envs.random_keys import derive, uniforms
 
@@ -34,6 +36,13 @@ class GraphPredictions(BaseTransitionModel):
     """
 
     fitted: Fitted
+    _kernel: tuple[Fitted, Lean | WholeKernel] | None = None
+
+    def kernel(self) -> Lean | WholeKernel:
+        """The graphs for compiled search, see ``compiled_model.py``."""
+        if self._kernel is None or self._kernel[0] is not self.fitted:
+            self._kernel = self.fitted, kernel_of(self.fitted, self.cardinalities)
+        return self._kernel[1]
 
     def _rows(self, states: States, actions: Actions) -> tuple[States, Actions]:
         states, actions = np.ascontiguousarray(states, dtype=np.int64), np.ascontiguousarray(actions, dtype=np.int64)

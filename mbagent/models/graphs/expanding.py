@@ -1,0 +1,291 @@
+"""Decision graphs inside compiled search: of a state, only the units that it touches are asked (see ``lean.py``).
+
+The outcomes are those of ``listing.successors``, at a cost that grows with what is going on in a state and not with the
+number of its variables.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from mbagent.models.compiled_model import Outcomes, implements, outcomes, work_for
+from mbagent.models.graphs.compiled import Bools, Floats, Ints, meets
+from mbagent.models.graphs.draws import settled
+from mbagent.models.graphs.lean import (
+    COUPLING,
+    FIRST,
+    MEMBERS,
+    OUTPUTS,
+    START,
+    Lean,
+    Words,
+    rates_of,
+    show_state,
+    touched_units,
+)
+from mbagent.models.particles import FOUND, Particles, begin, new_particles, prune, split
+from mbagent_envs._compiled import compiled
+
+Grid: TypeAlias = tuple[int, np.uint64, float]
+"""Number of draws, their key and offset; see ``particles.py``."""
+
+
+class GraphWork(NamedTuple):
+    """Work space; ``on`` is between two calls as where everything is 0.
+
+    Attributes:
+        on: columns, bool [D].
+        rates: distributions of the touched units, [sum of cardinalities].
+        joint: that of a unit or coupling.
+        different: factors that are not 0, int64 [F].
+        words: units touched, uint64 [W].
+        units: the same, int64 [U].
+        values: their present values, int64 [U].
+        coupled: those of them that are in couplings, one coupling after the other, int64 [U].
+        per_coupling: how many are in each, int64 [Q].
+        opened: what is uncertain: a unit and -1, or where a coupling's units begin and how many they are, int64 [U + Q, 2].
+        p: particles.
+        base: the next state but for what is uncertain, int64 [F].
+    """
+
+    on: Bools
+    rates: Floats
+    joint: Floats
+    different: Ints
+    words: Words
+    units: Ints
+    values: Ints
+    coupled: Ints
+    per_coupling: Ints
+    opened: Ints
+    p: Particles
+    base: Ints
+
+
+@implements(work_for, Lean)
+@compiled
+def graph_work(g: Lean, n_grid: int) -> GraphWork:
+    """See compiled_model."""
+    n_units, n_factors, n_couplings = len(g.units), len(g.row) - 1, len(g.exactly)
+    width = n_units + n_couplings
+    return GraphWork(
+        g.usual_on.copy(),
+        np.empty(len(g.base), dtype=np.float64),
+        np.empty(max(g.units[:, OUTPUTS].max(), n_units) + 1, dtype=np.float64),
+        np.empty(n_factors, dtype=np.int64),
+        np.empty(g.always.shape[1], dtype=np.uint64),
+        np.empty(n_units, dtype=np.int64),
+        np.empty(n_units, dtype=np.int64),
+        np.empty(n_units, dtype=np.int64),
+        np.zeros(n_couplings, dtype=np.int64),
+        np.empty((width, 2), dtype=np.int64),
+        new_particles(n_grid, width),
+        np.empty(n_factors, dtype=np.int64),
+    )
+
+
+@implements(outcomes, Lean)
+@compiled
+def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.uint64, offset: float, out: Outcomes) -> int:
+    """See compiled_model."""
+    grid, total = (n_grid, key, offset), 0
+    cells, meetings, usual = g.cells, g.meetings, g.usual_on
+    shown, columns, on = g.shown, g.columns, work.on
+    units, members, entries = g.units, g.members, g.entries
+    entry, node, leaf = g.entry, g.node, g.leaf
+    habit, base_rates, still = g.habit, g.base, g.still
+    exactly, row, touched = g.exactly, g.row, g.touched
+    by_meeting, always, rates = g.by_meeting, g.always, work.rates
+    joint, different, words = work.joint, work.different, work.words
+    listed, values, coupled = work.units, work.values, work.coupled
+    per_coupling, opened, base = work.per_coupling, work.opened, work.base
+    p = work.p
+    n_actions, first_meeting = len(always), len(columns) + len(always)
+    n_different = show_state(state, shown, columns, different, on)
+    for m in range(len(meetings)):
+        on[first_meeting + m] = meets(state, cells, meetings[m])
+    for action in range(n_actions):
+        n = touched_units(
+            action, state, different[:n_different], row, touched, by_meeting, always, first_meeting, on, usual, words, listed
+        )
+        on[len(columns) + action] = True
+        rates_of(
+            listed[:n], state, action, on, units, members, entries, entry, node, leaf, habit, base_rates, still, values, rates
+        )
+        on[len(columns) + action] = False
+        for f in range(len(state)):
+            base[f] = state[f]
+        n_live, n_open, ended = _settle(
+            listed[:n], units, members, exactly, values, rates, joint, coupled, per_coupling, opened, p, base, grid
+        )
+        _write(total, n_live, n_open, ended, base, opened, coupled, units, members, p, n_grid, out)
+        out.counts[action] = n_live
+        total += n_live
+    for i in range(n_different):
+        for column in range(shown[different[i]], shown[different[i] + 1]):
+            on[column] = usual[column]
+    return total
+
+
+@compiled
+def _settle(
+    touched: Ints,
+    units: Ints,
+    members: Ints,
+    exactly: Bools,
+    values: Ints,
+    rates: Floats,
+    joint: Floats,
+    coupled: Ints,
+    per_coupling: Ints,
+    opened: Ints,
+    p: Particles,
+    base: Ints,
+    grid: Grid,
+) -> tuple[int, int, bool]:
+    """Writes what is sure to ``base`` and shares the particles over the rest; returns (particles, open ones, whether it ends)."""
+    n_units, n_live, n_open, ended = len(units), begin(p, grid[0]), 0, False
+    for i in range(len(touched)):
+        unit = touched[i]
+        if units[unit, COUPLING] >= 0:
+            per_coupling[units[unit, COUPLING]] += 1
+            continue
+        n, start = units[unit, OUTPUTS], units[unit, START]
+        best = settled(rates, start, n)
+        if best < 0:
+            for k in range(n):
+                joint[k] = rates[start + k]
+            n_live = _share(p, n_live, unit, n_open, joint, n, grid)
+            opened[n_open, 0], opened[n_open, 1] = unit, -1
+            n_open += 1
+        elif unit == n_units - 2:
+            ended = best == 1
+        elif best != values[i]:
+            _put(base, unit, best, units, members)
+    n_live, n_open = _settle_couplings(
+        touched, units, members, exactly, rates, joint, coupled, per_coupling, opened, p, base, n_live, n_open, grid
+    )
+    return n_live, n_open, ended
+
+
+@compiled
+def _settle_couplings(
+    touched: Ints,
+    units: Ints,
+    members: Ints,
+    exactly: Bools,
+    rates: Floats,
+    joint: Floats,
+    coupled: Ints,
+    per_coupling: Ints,
+    opened: Ints,
+    p: Particles,
+    base: Ints,
+    n_live: int,
+    n_open: int,
+    grid: Grid,
+) -> tuple[int, int]:
+    """The same for couplings."""
+    n_units, first = len(units), 0
+    for q in range(len(exactly)):
+        n = per_coupling[q]
+        if n == 0:
+            continue
+        per_coupling[q] = 0
+        best = _couple(q, first, touched, units, exactly[q], rates, coupled, joint)
+        if best >= 0:
+            _choose(base, coupled, first, n, best, units, members)
+        else:
+            n_live = _share(p, n_live, n_units + q, n_open, joint, n + 1, grid)
+            opened[n_open, 0], opened[n_open, 1] = first, n
+            n_open += 1
+        first += n
+    return n_live, n_open
+
+
+@compiled
+def _write(
+    total: int,
+    n_live: int,
+    n_open: int,
+    ended: bool,
+    base: Ints,
+    opened: Ints,
+    coupled: Ints,
+    units: Ints,
+    members: Ints,
+    p: Particles,
+    n_grid: int,
+    out: Outcomes,
+) -> None:
+    """Writes the outcomes that the particles stand for from number ``total`` on, weighted as ``particles.assemble`` does."""
+    states, terminated, probabilities, factors, mass, n_units = (
+        out.states, out.terminated, out.probabilities, p.factors, p.mass, len(units),
+    )  # fmt: skip
+    everything = 0.0
+    for q in range(n_live):
+        everything += mass[q]
+    for q in range(n_live):
+        state, over = states[total + q], ended
+        for f in range(len(base)):
+            state[f] = base[f]
+        for v in range(n_open):
+            number, n = opened[v, 0], opened[v, 1]
+            if n >= 0:
+                _choose(state, coupled, number, n, factors[q, v], units, members)
+            elif number == n_units - 2:
+                over = factors[q, v] == 1
+            else:
+                _put(state, number, factors[q, v], units, members)
+        terminated[total + q] = over
+        probabilities[total + q] = mass[q] / everything if everything >= FOUND else p.points[q] / n_grid
+
+
+@compiled
+def _share(p: Particles, n_live: int, number: int, n_open: int, joint: Floats, n: int, grid: Grid) -> int:
+    """Shares all particles among the values of a unit or coupling that is uncertain; returns how many there are."""
+    prune(joint, n)
+    for q in range(n_live):
+        n_live = split(p, q, n_live, number, n_open, joint, n, grid[0], grid[1], grid[2])
+    return n_live
+
+
+@compiled
+def _couple(
+    coupling: int, first: int, touched: Ints, units: Ints, exactly: bool, rates: Floats, coupled: Ints, out: Floats
+) -> int:
+    """Lists a coupling's touched units from ``coupled[first]`` on, and their chances; returns the only one worth drawing, or -1.
+
+    As ``couplings.couple``; the last chance is that of none.
+    """
+    n, total = 0, 0.0
+    for unit in touched:
+        if units[unit, COUPLING] == coupling:
+            coupled[first + n] = unit
+            out[n] = rates[units[unit, START] + 1]
+            total += out[n]
+            n += 1
+    none = 0.0 if exactly and total > 1e-9 else max(0.0, 1.0 - total)
+    for k in range(n):
+        out[k] /= total + none
+    out[n] = none / (total + none)
+    return settled(out, 0, n + 1)
+
+
+@compiled
+def _choose(state: Ints, coupled: Ints, first: int, n: int, chosen: int, units: Ints, members: Ints) -> None:
+    """Switches one of a coupling's listed bits on and the others off."""
+    for k in range(n):
+        state[members[units[coupled[first + k], FIRST]]] = 1 if k == chosen else 0
+
+
+@compiled
+def _put(state: Ints, unit: int, value: int, units: Ints, members: Ints) -> None:
+    """Gives a unit its value."""
+    first, n = units[unit, FIRST], units[unit, MEMBERS]
+    if n == 1:
+        state[members[first]] = value
+    for member in range(n if n > 1 else 0):
+        state[members[first + member]] = 1 if member == value else 0

@@ -1,0 +1,130 @@
+"""Decision graphs inside compiled search where some units are drawn late, or rare events happen: every unit is asked."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mbagent.models.compiled_model import Outcomes, implements, outcomes, work_for
+from mbagent.models.graphs import expanding as expanding  # its overloads
+from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, distributions, n_columns, show
+from mbagent.models.graphs.fitting import Fitted, nothing_late
+from mbagent.models.graphs.lean import Lean, lean
+from mbagent.models.graphs.listing import successors
+from mbagent.models.graphs.units import Layout
+from mbagent.models.particles import FOUND
+from mbagent_envs._compiled import compiled
+
+
+class WholeKernel(NamedTuple):
+    """Decision graphs for compiled search, where some units are drawn late, or rare events happen.
+
+    Attributes:
+        layout, usual, late, event: see ``fitting.Fitted``.
+        event_late: graphs of nothing.
+        has_event: whether there are rare events.
+    """
+
+    layout: Layout
+    usual: Graphs
+    late: Graphs
+    event: Graphs
+    event_late: Graphs
+    has_event: bool
+
+
+def kernel_of(fitted: Fitted, cardinalities: tuple[int, ...]) -> Lean | WholeKernel:
+    """The kernel of fitted graphs: the lean one where it says everything."""
+    if not fitted.has_event and len(fitted.late.changing) == 0:
+        return lean(fitted.layout, fitted.usual, cardinalities)
+    none = nothing_late(fitted.event)
+    return WholeKernel(fitted.layout, fitted.usual, fitted.late, fitted.event, none, bool(fitted.has_event))
+
+
+class WholeWork(NamedTuple):
+    """Work space.
+
+    Attributes:
+        on: columns, bool [D].
+        values: of the units, int64 [U].
+        rates: their distributions, [sum of cardinalities].
+        actions: int64 [A].
+        states: int64 [A, F].
+        event: number of the event's unit, int64 [1].
+    """
+
+    on: Bools
+    values: Ints
+    rates: Floats
+    actions: Ints
+    states: Ints
+    event: Ints
+
+
+@implements(work_for, WholeKernel)
+@compiled
+def whole_work(kernel: WholeKernel, n_grid: int) -> WholeWork:
+    """See compiled_model."""
+    layout = kernel.layout
+    return WholeWork(
+        np.empty(n_columns(layout), dtype=np.bool_),
+        np.empty(len(layout.outputs), dtype=np.int64),
+        np.empty(kernel.usual.start[-1], dtype=np.float64),
+        np.arange(layout.n_actions),
+        np.empty((layout.n_actions, layout.n_factors), dtype=np.int64),
+        np.array([len(layout.outputs) - 1]),
+    )
+
+
+@implements(outcomes, WholeKernel)
+@compiled
+def whole_outcomes(
+    kernel: WholeKernel, work: WholeWork, state: Ints, n_grid: int, key: np.uint64, offset: float, out: Outcomes
+) -> int:
+    """See compiled_model; every unit is asked."""
+    layout, graphs, states, actions, total = kernel.layout, kernel.usual, work.states, work.actions, 0
+    states[:] = state
+    found = successors(states, actions, layout, graphs, kernel.late, n_grid, key, offset)
+    begins = 0
+    for action in range(layout.n_actions):
+        rate = 0.0
+        if kernel.has_event:
+            show(state, action, layout, work.on)
+            distributions(work.event, state, action, layout, graphs, work.on, work.values, work.rates)
+            rate = work.rates[graphs.start[-1] - 1]
+        rate = rate if rate * n_grid >= 1.0 else 0.0
+        ends = begins + found[0][action]
+        n = _take(
+            found[1][begins:ends],
+            found[2][begins:ends],
+            found[3][begins:ends],
+            found[4][begins:ends],
+            1.0 - rate,
+            n_grid,
+            total,
+            out,
+        )
+        begins = ends
+        if rate > 0.0:
+            a = action
+            rare = successors(states[:1], actions[a : a + 1], layout, kernel.event, kernel.event_late, n_grid, key, offset)
+            n += _take(rare[1], rare[2], rare[3], rare[4], rate, n_grid, total + n, out)
+        out.counts[action] = n
+        total += n
+    return total
+
+
+@compiled
+def _take(
+    states: Ints, terminated: Bools, mass: Floats, points: Ints, share: float, n_grid: int, total: int, out: Outcomes
+) -> int:
+    """Takes outcomes over, from number ``total`` on, which have a share of all; returns how many."""
+    if share <= 0.0:
+        return 0
+    everything = mass.sum()
+    for q in range(len(states)):
+        out.states[total + q] = states[q]
+        out.terminated[total + q] = terminated[q]
+        out.probabilities[total + q] = share * (mass[q] / everything if everything >= FOUND else points[q] / n_grid)
+    return len(states)

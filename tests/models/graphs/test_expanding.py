@@ -1,0 +1,103 @@
+"""Decision graphs in compiled search: the same imagined world as by the model's own successors, for any kind of model."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from mbagent.models.factory import build_model
+from mbagent.models.graphs import DecisionGraphModel
+from mbagent.models.graphs.lean import Lean
+from mbagent.models.graphs.whole import WholeKernel
+from mbagent.models.state_graph import StateGraph
+from mbagent.planning.lookahead import grow_lookahead
+from mbagent.spaces import FactoredSpace
+from mbagent_envs import FlierCatcher, GeyserRunner, Maneuverer
+from mbagent_envs.game import Game
+from tests.models.graphs.test_model import CARDINALITIES, small_world
+from tests.models.helpers import dataset, played
+
+
+def of_game(game: Game) -> tuple[DecisionGraphModel, np.ndarray]:
+    data = played(game, 1500, 100)
+    model = build_model("graphs", FactoredSpace(game.observation_space), int(game.action_space.n), 0.02)
+    assert isinstance(model, DecisionGraphModel)
+    model.fit(data)
+    return model, data.rows().states
+
+
+def of_games_bits(game: Game) -> tuple[DecisionGraphModel, np.ndarray]:
+    data = played(game, 3000, 100)
+    model = DecisionGraphModel(data.cardinalities, int(game.action_space.n))
+    model.fit(data)
+    return model, data.rows().states
+
+
+def of_small_world() -> tuple[DecisionGraphModel, np.ndarray]:
+    states, actions, following, terminated = small_world(4000, 0)
+    model = DecisionGraphModel(CARDINALITIES, 2)
+    model.fit(dataset(CARDINALITIES, 2, states, actions, following, terminated))
+    return model, states
+
+
+WORLDS: dict[str, Callable[[], tuple[DecisionGraphModel, np.ndarray]]] = {
+    "planes with redraws": lambda: of_game(Maneuverer(size=4)),
+    "planes with luck": lambda: of_game(FlierCatcher(height=4, width=5)),
+    "groups": lambda: of_game(GeyserRunner()),
+    "rare events": lambda: of_games_bits(Maneuverer(size=4)),
+    "wheels and ends": of_small_world,
+}
+
+
+def edges(graph: StateGraph, node: int) -> list[tuple[int, bytes, bool, float]]:
+    rows = np.flatnonzero(graph.sources == node)
+    states = graph.states[graph.next_nodes[rows]]
+    parts = zip(graph.actions[rows], states, graph.terminated[rows], graph.probabilities[rows], strict=True)
+    return sorted((int(a), s.tobytes(), bool(t), round(float(p), 6)) for a, s, t, p in parts)
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_compiled_expansion_is_that_of_the_successors(name: str) -> None:
+    model, states = WORLDS[name]()
+    roots = np.unique(states[::7], axis=0)[:60]
+    compiled, plain = StateGraph(model), StateGraph(model)
+    assert isinstance(compiled.kernel, Lean | WholeKernel)
+    plain.kernel = None
+    groups = np.zeros(len(roots), dtype=np.int64)
+    for draws in (1, 4, 16):
+        for graph in (compiled, plain):
+            graph.clear()
+            graph.expand(graph.add(roots, groups), draws, seed=draws)
+        assert compiled.expanded[: len(roots)].all()
+        for node in range(len(roots)):
+            assert edges(compiled, node) == edges(plain, node)
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_compiled_lookahead_is_that_of_any_model(name: str) -> None:
+    model, states = WORLDS[name]()
+    roots = states[[0, 40, 80]]
+    graphs = []
+    for compiled in (True, False):
+        graph = StateGraph(model)
+        graph.kernel = graph.kernel if compiled else None
+        grow_lookahead(graph, graph.add(roots, np.arange(3)), max_states=50, n_samples=4, horizon=12, seed=5)
+        graphs.append(graph)
+    for group in range(3):
+        worlds = [
+            {g.states[node].tobytes(): edges(g, int(node)) for node in np.flatnonzero(g.expanded & (g.groups == group))}
+            for g in graphs
+        ]
+        assert worlds[0] == worlds[1]
+
+
+def test_a_graph_that_was_cleared_is_as_new() -> None:
+    model, states = WORLDS["groups"]()
+    graph = StateGraph(model)
+    for _ in range(3):
+        graph.clear()
+        grow_lookahead(graph, graph.add(states[:1], np.zeros(1, dtype=np.int64)), 20, 4, horizon=9, seed=1)
+        sizes = len(graph), graph.n_edges
+        assert graph.expanded.sum() == 20
+    assert sizes == (len(graph), graph.n_edges)
+    assert graph.find(states[:1])[0] == 0
