@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from mbagent.models.base import States, TransitionModel
-from mbagent.models.state_graph import StateGraph
+from mbagent.models.base import Floats, States, TransitionModel
+from mbagent.models.state_graph import Indices, StateGraph
 from mbagent.planning.goal import Goal
 from mbagent.planning.lookahead import grow_lookahead
 from mbagent.planning.planner import Plan, PlannerSettings, best_actions
 from mbagent.planning.value_iteration import Machine, Values, break_ties, solve
+
+ROOTS_AT_ONCE = 16
+"""Roots that are imagined around together; bounds the memory."""
 
 
 class MachinePlanner:
@@ -26,10 +29,11 @@ class MachinePlanner:
         self._goal: Goal | None = None
         self._start: States | None = None
         self._machine: Machine | None = None
+        self._imagined: StateGraph | None = None
 
     def set_model(self, model: TransitionModel, start_states: States) -> None:
         """See Planner. The machine is generated at the next ``plan``."""
-        self._model, self._start, self._machine = model, start_states, None
+        self._model, self._start, self._machine, self._imagined = model, start_states, None, None
 
     def set_goal(self, goal: Goal) -> None:
         """See Planner. The machine stays, its values go."""
@@ -41,30 +45,33 @@ class MachinePlanner:
         """See Planner."""
         machine = self._solved_machine()
         nodes = machine.find(roots)
-        known = nodes >= 0
         n_actions = self._known_model().n_actions
         values, visits = np.zeros((len(roots), n_actions)), np.zeros((len(roots), n_actions))
-        scores = np.zeros((len(roots), n_actions))
-        if known.any() and machine.graph is not None and machine.values is not None:
-            found = self._search(machine.graph, machine.values, nodes[known], shared=True)
-            values[known], visits[known], scores[known] = found
-        if not known.all():
-            graph, solution, local = self._lookahead(roots[~known])
-            found = self._search(graph, solution, local, shared=False)
-            values[~known], visits[~known], scores[~known] = found
+        scores, known = np.zeros((len(roots), n_actions)), np.flatnonzero(nodes >= 0)
+        if len(known) and machine.graph is not None and machine.values is not None:
+            values[known] = machine.values.q[nodes[known]]
+            scores[known] = break_ties(machine.graph, machine.values.q, nodes[known], self.settings.gamma)
+        unknown = np.flatnonzero(nodes < 0)
+        for begin in range(0, len(unknown), ROOTS_AT_ONCE):
+            some = unknown[begin : begin + ROOTS_AT_ONCE]
+            values[some], visits[some], scores[some] = self._search(*self._lookahead(roots[some]))
         return Plan(best_actions(scores), values, visits)
 
-    def _search(
-        self, graph: StateGraph, solution: Values, nodes: np.ndarray, shared: bool
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _search(self, graph: StateGraph, solution: Values, nodes: Indices) -> tuple[Floats, Floats, Floats]:
         """(values, visits, scores) [R, A] of the root nodes [R]; here the values as they are, without a search."""
-        del shared
         values = solution.q[nodes]
         return values, np.zeros_like(values), break_ties(graph, solution.q, nodes, self.settings.gamma)
 
-    def _lookahead(self, roots: States) -> tuple[StateGraph, Values, np.ndarray]:
+    def _empty_graph(self) -> StateGraph:
+        """A graph for the next roots; what the last one held is gone."""
+        if self._imagined is None:
+            self._imagined = StateGraph(self._known_model())
+        self._imagined.clear()
+        return self._imagined
+
+    def _lookahead(self, roots: States) -> tuple[StateGraph, Values, Indices]:
         """A machine around each root [R, F], solved; root r is in group r. Returns (graph, values, root nodes)."""
-        graph, settings = StateGraph(self._known_model()), self.settings
+        graph, settings = self._empty_graph(), self.settings
         nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
         grow_lookahead(
             graph,

@@ -8,7 +8,7 @@ successor edges.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,7 @@ from mbagent_envs.random_keys import uniform_at
 Ints = NDArray[np.int64]
 
 
-@dataclass
-class Paths:
+class Paths(NamedTuple):
     """What the simulations of one wave passed through.
 
     Attributes:

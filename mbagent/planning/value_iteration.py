@@ -81,7 +81,7 @@ def settle(graph: StateGraph, values: Values, gamma: float, max_sweeps: int = MA
         only: bool [G], the groups to work on; None for all.
     """
     active = np.ones(len(values.frontier), dtype=np.bool_) if only is None else only.copy()
-    _sweep(graph.arrays, values.rewards, gamma, TOLERANCE, max_sweeps, active, values.v, values.q, values.frontier)
+    sweep(graph.arrays, values.rewards, gamma, TOLERANCE, max_sweeps, active, values.v, values.q, values.frontier)
 
 
 @compiled
@@ -111,7 +111,7 @@ def _set_frontier(graph: GraphArrays, active: Bools, lows: Floats, moved: Floats
 
 
 @compiled
-def _sweep(
+def sweep(
     graph: GraphArrays,
     rewards: Floats,
     gamma: float,
@@ -122,7 +122,10 @@ def _sweep(
     q: Floats,
     frontier: Floats,
 ) -> None:
-    """Sweeps over the ``active`` groups (overwritten); updates the last three arguments (see Values)."""
+    """Sweeps over the ``active`` groups (overwritten); updates the last three arguments (see Values).
+
+    ``rewards``, ``v`` and ``q`` are as long as the graph has edges and nodes in use.
+    """
     n_groups = len(frontier)
     lows = np.full(n_groups, np.inf)
     # Every group stops by its own measure: its values must not depend on what else is solved in the same call.
