@@ -1,11 +1,13 @@
 """Error estimates: honest on a world that is half known, rising where nothing was seen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mbagent.models.graphs import DecisionGraphModel
 from mbagent.models.tabular import TabularModel
-from mbagent.models.trust import estimate_error, likeliest, missed, with_gaps
+from mbagent.models.trust import estimate_error, likeliest, missed, parts_of
 from mbagent.transitions import TransitionDataset
 from tests.models.helpers import dataset
 
@@ -52,12 +54,39 @@ def test_models_without_a_likeliest_state_of_their_own_have_each_factors() -> No
     assert not ends.any()
 
 
-def test_parts_are_left_out_by_whole_episodes() -> None:
+def test_parts_are_whole_episodes() -> None:
     rows = world(400, 0).rows()
-    parts = with_gaps(rows, 5, 0)
-    assert [len(part) for part in parts] == [320] * 5
-    left_out = [set(rows.episodes) - set(part.episodes) for part in parts]
-    assert set().union(*left_out) == set(rows.episodes)
+    part = parts_of(rows, 5, 0)
+    np.testing.assert_array_equal(np.bincount(part), [80] * 5)
+    assert sum(len(set(rows.episodes[part == number])) for number in range(5)) == len(set(rows.episodes))
+
+
+def test_few_long_episodes_are_cut_into_runs() -> None:
+    rows = replace(world(400, 0).rows(), episodes=np.zeros(400, dtype=np.int64))
+    part = parts_of(rows, 5, 0)
+    np.testing.assert_array_equal(np.bincount(part), [80] * 5)
+    assert (np.diff(part) != 0).sum() <= 9
+
+
+def test_models_without_probabilities_are_refused_before_anything_is_fitted() -> None:
+    class Unfitted(TabularModel):
+        def log_prob(self, *_: object) -> np.ndarray:
+            raise NotImplementedError
+
+    def build() -> TabularModel:
+        raise AssertionError("nothing should be built")
+
+    with pytest.raises(NotImplementedError, match="needs exact probabilities, which Unfitted does not have"):
+        estimate_error(build, Unfitted(CARDS, 2), world(400, 0))
+
+
+def test_what_all_data_would_settle_is_not_counted_as_error() -> None:
+    data = world(400, 0)
+    model = TabularModel(CARDS, 2)
+    model.fit(data)
+    rows = world(20_000, 1).rows()
+    error = estimate_error(lambda: TabularModel(CARDS, 2), model, data)
+    assert error(rows.states, rows.actions).mean() == pytest.approx(missed(model, rows).mean(), rel=0.25)
 
 
 def test_too_little_data_is_one_clear_sentence() -> None:
