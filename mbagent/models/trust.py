@@ -3,13 +3,11 @@
 A model knows how random the world is, not how wrong it may be itself. Models learned without one part of the episodes or
 another disagree where there is little to go by (the jackknife); how often predictions with so much doubt were wrong
 on episodes held out, each part in turn, makes an honest probability of it (isotonic regression; Zadrozny and Elkan 2002).
-Models of all data err less than those of a part; how much less is read off from models of still smaller parts.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -104,19 +102,13 @@ def estimate_error(
     part = parts_of(rows, n_members, seed)
     members = tuple(fitted(part != number) for number in range(n_members))
     without = {pair: fitted(~np.isin(part, pair)) for pair in itertools.combinations(range(n_members), 2)}
-    doubts, wrong, wrong_with_less = [], [], []
+    doubts, wrong = [], []
     for number, member in enumerate(members):
         fewer = tuple(other for pair, other in without.items() if number in pair)
         held_out = rows.select(part == number)
-        inner = ModelError(member, fewer, *_AS_IT_STANDS)
-        doubts.append(inner.doubt(held_out.states, held_out.actions))
+        doubts.append(ModelError(member, fewer, *_AS_IT_STANDS).doubt(held_out.states, held_out.actions))
         wrong.append(missed(member, held_out))
-        wrong_with_less.append(np.mean([missed(other, held_out) for other in fewer], axis=0))
-    shrinks = min(1.0, _rate(np.concatenate(wrong)) / _rate(np.concatenate(wrong_with_less)))
-    # Errors are taken to fall as a power of the data: by this much from n - 2 to n - 1 parts, and so from there to all n.
-    power = math.log(n_members / (n_members - 1)) / math.log((n_members - 1) / (n_members - 2))
-    levels, rates = _calibrated(np.concatenate(doubts), np.concatenate(wrong))
-    return ModelError(model, members, levels, rates * shrinks**power)
+    return ModelError(model, members, *_calibrated(np.concatenate(doubts), np.concatenate(wrong)))
 
 
 def _check_probabilities(model: TransitionModel, row: TransitionBatch) -> None:
@@ -132,11 +124,6 @@ def _check_probabilities(model: TransitionModel, row: TransitionBatch) -> None:
             f"An error estimate needs exact probabilities, which {type(model).__name__} does not have; use one that has "
             'log_prob, such as model="graphs".'
         ) from error
-
-
-def _rate(wrong: Bools | Floats) -> float:
-    """Share of wrong predictions; one more is added, so that few say little."""
-    return float((wrong.sum() + 1.0) / (len(wrong) + 1.0))
 
 
 def parts_of(rows: TransitionBatch, n_parts: int, seed: int) -> Ints:
@@ -170,7 +157,10 @@ def missed(model: TransitionModel, rows: TransitionBatch) -> Bools:
 
 
 def _calibrated(doubts: Floats, wrong: Bools) -> tuple[Floats, Floats]:
-    """Doubts and how often they were right, ascending; with few held-out transitions a doubt is believed as it stands."""
+    """Doubts and how often they were wrong, ascending; with few held-out transitions a doubt is believed as it stands.
+
+    Doubts of one rate stand at their mean, so that between them more doubt is more (Oron and Flournoy 2017).
+    """
     own = np.quantile(doubts, np.linspace(0.0, 1.0, 11)) if len(doubts) else np.zeros(0)
     x = np.concatenate([doubts, own, [0.0, 1.0]])
     y = np.concatenate([wrong.astype(np.float64), own, [0.0, 1.0]])
@@ -179,4 +169,5 @@ def _calibrated(doubts: Floats, wrong: Bools) -> tuple[Floats, Floats]:
     levels, place = np.unique(x[order], return_inverse=True)
     total = np.bincount(place, weights=weights[order])
     mean = np.bincount(place, weights=(weights * y)[order]) / total
-    return levels, isotonic_regression(mean, weights=total).x
+    rates, step = np.unique(isotonic_regression(mean, weights=total).x, return_inverse=True)
+    return np.bincount(step, weights=total * levels) / np.bincount(step, weights=total), rates

@@ -7,7 +7,7 @@ import pytest
 
 from mbagent.models.graphs import DecisionGraphModel
 from mbagent.models.tabular import TabularModel
-from mbagent.models.trust import estimate_error, likeliest, missed, parts_of
+from mbagent.models.trust import _calibrated, estimate_error, likeliest, missed, parts_of
 from mbagent.transitions import TransitionDataset
 from tests.models.helpers import dataset
 
@@ -80,13 +80,14 @@ def test_models_without_probabilities_are_refused_before_anything_is_fitted() ->
         estimate_error(build, Unfitted(CARDS, 2), world(400, 0))
 
 
-def test_what_all_data_would_settle_is_not_counted_as_error() -> None:
-    data = world(400, 0)
-    model = TabularModel(CARDS, 2)
-    model.fit(data)
-    rows = world(20_000, 1).rows()
-    error = estimate_error(lambda: TabularModel(CARDS, 2), model, data)
-    assert error(rows.states, rows.actions).mean() == pytest.approx(missed(model, rows).mean(), rel=0.25)
+def test_more_doubt_is_more_within_steps_of_one_rate() -> None:
+    doubts = np.linspace(0.0, 1.0, 400)
+    x, y = _calibrated(doubts, doubts > 0.5)
+    assert (np.diff(x) > 0.0).all()
+    assert (np.diff(y) > 0.0).all()
+    np.testing.assert_allclose(np.interp([0.2, 0.8], x, y), [0.0, 1.0], atol=0.05)
+    x, y = _calibrated(doubts[::-1], doubts > 0.5)  # doubt that misleads tells nothing but the rate
+    np.testing.assert_allclose(np.interp(doubts, x, y).mean(), 0.5, atol=0.05)
 
 
 def test_too_little_data_is_one_clear_sentence() -> None:
