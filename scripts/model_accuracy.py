@@ -55,8 +55,8 @@ class Args:
     output: Path = Path("results/model_accuracy")
     """Folder for results.csv; results of an earlier run there are moved to a folder of their own inside it."""
     studies: tuple[str, ...] = tuple(name for name in STUDIES if name != "minatar")
-    """Further questions: changes of rules, transfer between sizes, cost, parents found, error estimates (trust), planning
-    (agents); minatar needs pip install "mbagent[minatar]". None with --studies alone."""
+    """Further questions: changes of rules, false alarms of such changes, transfer between sizes, cost, parents found, error
+    estimates (trust), planning (agents); minatar needs pip install "mbagent[minatar]". None with --studies alone."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Number of processes, each with one thread."""
 

@@ -2,7 +2,7 @@
 
 A model knows how random the world is, not how wrong it may be itself. Models learned without one part of the episodes or
 another disagree where there is little to go by (the jackknife); how often predictions with so much doubt were wrong
-on held-out episodes makes an honest probability of it (isotonic regression; Zadrozny and Elkan 2002).
+on episodes held out, each part in turn, makes an honest probability of it (isotonic regression; Zadrozny and Elkan 2002).
 """
 
 from __future__ import annotations
@@ -10,12 +10,16 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 from mbagent.models.base import Actions, Bools, Floats, States, TransitionModel
 from mbagent.transitions import TransitionBatch, TransitionDataset
+
+Ints: TypeAlias = NDArray[np.int64]
 
 BELIEVED = 20.0
 """Held-out transitions that a doubt counts for as it stands."""
@@ -65,7 +69,6 @@ def estimate_error(
     data: TransitionDataset,
     *,
     n_members: int = 5,
-    validation: float = 0.2,
     seed: int = 0,
 ) -> ModelError:
     """Learns how wrong a model may be.
@@ -74,39 +77,63 @@ def estimate_error(
         build: makes a new model of its kind.
         model: the model, fitted to ``data``; it needs exact probabilities.
         data: what it was fitted to.
-        n_members: models to hold beside it, each fitted to all but one of as many parts of the episodes; twice as many are
-            fitted, and one more, to learn how often they are wrong.
-        validation: share of episodes held out.
-        seed: of samples and splits.
+        n_members: models to hold beside it, each fitted to all but one of as many parts of the episodes; one more is fitted
+            for every two parts, without both, to learn how often the members are wrong: 15 fits in all for 5.
+        seed: of fits and parts.
 
     Raises:
-        ValueError: there are fewer than 50 transitions, or no members.
+        ValueError: there are fewer than 50 transitions, or fewer than 3 members.
+        NotImplementedError: the model has no exact probabilities.
     """
-    if len(data) < 50 or n_members < 2:
+    if len(data) < 50 or n_members < 3:
         raise ValueError(
-            f"An error estimate needs at least 50 transitions and 2 members, got {len(data)} and {n_members}; explore first."
+            f"An error estimate needs at least 50 transitions and 3 members, got {len(data)} and {n_members}; explore first."
         )
-    train, held_out = data.split(validation, seed)
+    rows = data.rows()
+    _check_probabilities(model, rows.select(np.arange(1)))
 
-    def fitted(rows: TransitionBatch) -> TransitionModel:
+    def fitted(kept: Bools) -> TransitionModel:
         sample = TransitionDataset(data.cardinalities, data.n_actions)
-        sample.append(rows)
+        sample.append(rows.select(kept))
         member = build()
         member.fit(sample, seed=seed)
         return member
 
-    inner = ModelError(fitted(train), tuple(map(fitted, with_gaps(train, n_members, seed))), *_AS_IT_STANDS)
-    curve = _calibrated(inner.doubt(held_out.states, held_out.actions), missed(inner.model, held_out))
-    return ModelError(model, tuple(map(fitted, with_gaps(data.rows(), n_members, seed))), *curve)
+    part = parts_of(rows, n_members, seed)
+    members = tuple(fitted(part != number) for number in range(n_members))
+    without = {pair: fitted(~np.isin(part, pair)) for pair in itertools.combinations(range(n_members), 2)}
+    doubts, wrong = [], []
+    for number, member in enumerate(members):
+        fewer = tuple(other for pair, other in without.items() if number in pair)
+        held_out = rows.select(part == number)
+        doubts.append(ModelError(member, fewer, *_AS_IT_STANDS).doubt(held_out.states, held_out.actions))
+        wrong.append(missed(member, held_out))
+    return ModelError(model, members, *_calibrated(np.concatenate(doubts), np.concatenate(wrong)))
 
 
-def with_gaps(rows: TransitionBatch, n_parts: int, seed: int) -> list[TransitionBatch]:
-    """The rows without one part of the episodes, once for each of ``n_parts``; few long episodes are cut into runs first."""
+def _check_probabilities(model: TransitionModel, row: TransitionBatch) -> None:
+    """Refuses a model without exact probabilities before anything is fitted.
+
+    Raises:
+        NotImplementedError: it has none.
+    """
+    try:
+        model.log_prob(row.states, row.actions, row.next_states, row.terminated)
+    except NotImplementedError as error:
+        raise NotImplementedError(
+            f"An error estimate needs exact probabilities, which {type(model).__name__} does not have; use one that has "
+            'log_prob, such as model="graphs".'
+        ) from error
+
+
+def parts_of(rows: TransitionBatch, n_parts: int, seed: int) -> Ints:
+    """Which of ``n_parts`` parts each row is in, by whole episodes, int64 [N]; few long episodes are cut into runs first."""
     groups = np.unique(rows.episodes, return_inverse=True)[1]
     if groups.max() + 1 < 2 * n_parts:
         groups = np.arange(len(rows)) * 2 * n_parts // len(rows)
     part = np.random.default_rng(seed).permutation(groups.max() + 1) % n_parts
-    return [rows.select(part[groups] != number) for number in range(n_parts)]
+    result: Ints = part[groups]
+    return result
 
 
 def likeliest(model: TransitionModel, states: States, actions: Actions) -> tuple[States, Bools]:
@@ -130,7 +157,10 @@ def missed(model: TransitionModel, rows: TransitionBatch) -> Bools:
 
 
 def _calibrated(doubts: Floats, wrong: Bools) -> tuple[Floats, Floats]:
-    """Doubts and how often they were right, ascending; with few held-out transitions a doubt is believed as it stands."""
+    """Doubts and how often they were wrong, ascending; with few held-out transitions a doubt is believed as it stands.
+
+    Doubts of one rate stand at their mean, so that between them more doubt is more (Oron and Flournoy 2017).
+    """
     own = np.quantile(doubts, np.linspace(0.0, 1.0, 11)) if len(doubts) else np.zeros(0)
     x = np.concatenate([doubts, own, [0.0, 1.0]])
     y = np.concatenate([wrong.astype(np.float64), own, [0.0, 1.0]])
@@ -139,4 +169,5 @@ def _calibrated(doubts: Floats, wrong: Bools) -> tuple[Floats, Floats]:
     levels, place = np.unique(x[order], return_inverse=True)
     total = np.bincount(place, weights=weights[order])
     mean = np.bincount(place, weights=(weights * y)[order]) / total
-    return levels, isotonic_regression(mean, weights=total).x
+    rates, step = np.unique(isotonic_regression(mean, weights=total).x, return_inverse=True)
+    return np.bincount(step, weights=total * levels) / np.bincount(step, weights=total), rates

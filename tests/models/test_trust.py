@@ -1,11 +1,13 @@
 """Error estimates: honest on a world that is half known, rising where nothing was seen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mbagent.models.graphs import DecisionGraphModel
 from mbagent.models.tabular import TabularModel
-from mbagent.models.trust import estimate_error, likeliest, missed, with_gaps
+from mbagent.models.trust import _calibrated, estimate_error, likeliest, missed, parts_of
 from mbagent.transitions import TransitionDataset
 from tests.models.helpers import dataset
 
@@ -52,12 +54,40 @@ def test_models_without_a_likeliest_state_of_their_own_have_each_factors() -> No
     assert not ends.any()
 
 
-def test_parts_are_left_out_by_whole_episodes() -> None:
+def test_parts_are_whole_episodes() -> None:
     rows = world(400, 0).rows()
-    parts = with_gaps(rows, 5, 0)
-    assert [len(part) for part in parts] == [320] * 5
-    left_out = [set(rows.episodes) - set(part.episodes) for part in parts]
-    assert set().union(*left_out) == set(rows.episodes)
+    part = parts_of(rows, 5, 0)
+    np.testing.assert_array_equal(np.bincount(part), [80] * 5)
+    assert sum(len(set(rows.episodes[part == number])) for number in range(5)) == len(set(rows.episodes))
+
+
+def test_few_long_episodes_are_cut_into_runs() -> None:
+    rows = replace(world(400, 0).rows(), episodes=np.zeros(400, dtype=np.int64))
+    part = parts_of(rows, 5, 0)
+    np.testing.assert_array_equal(np.bincount(part), [80] * 5)
+    assert (np.diff(part) != 0).sum() <= 9
+
+
+def test_models_without_probabilities_are_refused_before_anything_is_fitted() -> None:
+    class Unfitted(TabularModel):
+        def log_prob(self, *_: object) -> np.ndarray:
+            raise NotImplementedError
+
+    def build() -> TabularModel:
+        raise AssertionError("nothing should be built")
+
+    with pytest.raises(NotImplementedError, match="needs exact probabilities, which Unfitted does not have"):
+        estimate_error(build, Unfitted(CARDS, 2), world(400, 0))
+
+
+def test_more_doubt_is_more_within_steps_of_one_rate() -> None:
+    doubts = np.linspace(0.0, 1.0, 400)
+    x, y = _calibrated(doubts, doubts > 0.5)
+    assert (np.diff(x) > 0.0).all()
+    assert (np.diff(y) > 0.0).all()
+    np.testing.assert_allclose(np.interp([0.2, 0.8], x, y), [0.0, 1.0], atol=0.05)
+    x, y = _calibrated(doubts[::-1], doubts > 0.5)  # doubt that misleads tells nothing but the rate
+    np.testing.assert_allclose(np.interp(doubts, x, y).mean(), 0.5, atol=0.05)
 
 
 def test_too_little_data_is_one_clear_sentence() -> None:

@@ -18,6 +18,7 @@ from mbagent.analysis.pages import FIGURE_STYLE, format_number, render, to_png
 Row: TypeAlias = Mapping[str, Any]
 KEYS = {
     "changes": ("change", "steps after it"),
+    "alarms": ("world", "steps"),
     "transfer": ("size",),
     "cost": ("d", "size"),
     "parents": ("world", "steps"),

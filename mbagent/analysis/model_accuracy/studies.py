@@ -72,11 +72,28 @@ def changes(seed: int, full: bool) -> list[Row]:
         old = random_play(before, 10_000, seed, order)
         tests = random_play(after, N_TESTS, seed + 10_000, order)
         certain = certain_factors(SimulatorModel(after), tests, order, seed)
-        for steps in (100, 200, 300, 500, 700, 1000) if full else (100, 300, 500, 1000):
+        for steps in (50, 100, 200, 300, 500, 700, 1000) if full else (100, 200, 300, 500):
             new = random_play(after, steps, seed + 1, order)
             continued, fresh = learned(space, n_actions, old, new), learned(space, n_actions, new)
             figures = {"continued": exact(continued, tests, certain), "from scratch": exact(fresh, tests, certain)}
             rows.append({"change": name, "steps after it": steps, **figures})
+    return rows
+
+
+def alarms(seed: int, full: bool) -> list[Row]:
+    """False alarms: variables that are taken for changed in worlds whose rules never do."""
+    rows = []
+    for case in CASES:
+        game = case.game()
+        space, n_actions = FactoredSpace(game.observation_space), int(game.action_space.n)
+        order = np.arange(len(space))
+        if case.flat:
+            order, space = np.random.default_rng(seed).permutation(len(space)), FactoredSpace(MultiBinary(len(space)))
+        for steps in (1000, 2000, 5000, 10_000, 20_000) if full else (1000, 5000):
+            data = TransitionDataset(space.cardinalities, n_actions)
+            data.append(random_play(game, steps, seed, order))
+            report = build_model("auto", space, n_actions, LEARNING_RATE).fit(data, seed=0)
+            rows.append({"world": case.name, "steps": steps, "taken for changed": report.log["changed"]})
     return rows
 
 
@@ -240,6 +257,7 @@ def agents(seed: int, full: bool) -> list[Row]:
 
 STUDIES: dict[str, Callable[[int, bool], list[Row]]] = {
     "changes": changes,
+    "alarms": alarms,
     "transfer": transfer,
     "cost": cost,
     "parents": parents,

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mbagent.models.base import FitReport, Floats
+from mbagent.models.base import Bools, FitReport, Floats
 from mbagent.models.fit_report import Variable
 from mbagent.models.graphs.arrays import from_arrays, table_of, to_arrays
 from mbagent.models.graphs.channels import PlaneTable, channel_layout, find_couplings, learn_channels, learn_late
@@ -76,7 +76,7 @@ class LocalGraphModel(DecisionGraphModel):
         began = time.perf_counter()
         rows = data.rows()
         self._forget(self.local.cardinalities, self.given or self._best_reach(*data.split(self.validation, seed)))
-        since = self._since(rows)
+        since = self._since(rows, np.zeros(len(rows), dtype=np.bool_))
         train, held_out, train_since = self._split(data, seed, since)
         self._learn(train, since=train_since)
         likelihood, jointly = self._jointly(held_out)
@@ -113,7 +113,7 @@ class LocalGraphModel(DecisionGraphModel):
     def _with_memory(self, space: FactoredSpace) -> DecisionGraphModel:
         return LocalGraphModel(space, self.n_actions, self.reach)
 
-    def _since(self, rows: TransitionBatch) -> Ints:
+    def _since(self, rows: TransitionBatch, events: Bools) -> Ints:
         """First row that tells of each channel, and of ``terminated``, as it is now."""
         return still_true_since(rows, len(self.local.cardinalities) + 1, self._channels_foretold)
 

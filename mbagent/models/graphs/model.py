@@ -19,6 +19,7 @@ from mbagent.models.fit_report import Variable, VariableReport, describe
 from mbagent.models.graphs.arrays import from_arrays, table_of, to_arrays
 from mbagent.models.graphs.compiled import Graphs, build, habit_of, n_columns
 from mbagent.models.graphs.events import flag_events
+from mbagent.models.graphs.exclusive import find_groups
 from mbagent.models.graphs.fitting import Fitted, fit_graphs, nothing_late
 from mbagent.models.graphs.parents import flat_variables
 from mbagent.models.graphs.predictions import GraphPredictions
@@ -76,7 +77,8 @@ class DecisionGraphModel(GraphPredictions):
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel."""
         began = time.perf_counter()
-        rows, events, since = data.rows(), self._events(data, seed), self._since(data.rows())
+        rows, events = data.rows(), self._events(data, seed)
+        since = self._since(rows, events)
         train, held_out, train_since = self._split(data, seed, since)
         if progress is not None:
             progress(0.4)
@@ -97,9 +99,25 @@ class DecisionGraphModel(GraphPredictions):
         report = replace(report, variables=variables, calibration=calibration, memory=memory)
         return replace(report, seconds=time.perf_counter() - began)
 
-    def _since(self, rows: TransitionBatch) -> NDArray[np.int64]:
-        """First row that tells of each factor, and of ``terminated``, as it is now."""
-        return still_true_since(rows, len(self.cardinalities) + 1, self._factors_foretold)
+    def _since(self, rows: TransitionBatch, events: Bools) -> NDArray[np.int64]:
+        """First row that tells of each factor, and of ``terminated``, as it is now, int64 [F + 1]."""
+        usual, before = np.flatnonzero(~events), self._kept()
+        groups = find_groups(self.cardinalities, rows.states, rows.next_states, ~events)
+        variable = np.arange(len(self.cardinalities) + 1)
+        for group in groups:
+            variable[list(group)] = group[0]
+        variable = np.unique(variable, return_inverse=True)[1]
+        grouped = np.isin(np.arange(len(self.cardinalities)), [f for group in groups for f in group])
+
+        def foretell(train: TransitionBatch, tests: TransitionBatch) -> Floats:
+            logs = self._factors_foretold(train, tests)
+            logs[:, :-1][grouped & (tests.next_states == 0)] = 0.0  # a group's value is told by the bit that is on
+            return np.stack([logs[:, variable == v].sum(axis=1) for v in range(variable.max() + 1)], axis=1)
+
+        self.fitted = replace(self.fitted, has_event=False)
+        since = still_true_since(rows.select(usual), variable.max() + 1, foretell)
+        self._restore(before)
+        return np.where(since > 0, usual[since], 0)[variable]
 
     def _split(
         self, data: TransitionDataset, seed: int, since: NDArray[np.int64]
