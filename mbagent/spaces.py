@@ -146,9 +146,11 @@ class FactoredSpace:
         start = 0
         for leaf in self._leaves:
             stop = start + len(leaf.cardinalities)
-            values = factors[:, start:stop].astype(np.int64) + leaf.low
+            values = factors[:, start:stop].astype(np.int64)  # a copy: what is made of it may be changed
+            if leaf.low.any():
+                values += leaf.low
             dtype = np.dtype(np.int64) if integers else np.dtype(leaf.space.dtype)
-            parts[leaf.path] = values.reshape(len(factors), *leaf.shape).astype(dtype)
+            parts[leaf.path] = values.reshape(len(factors), *leaf.shape).astype(dtype, copy=False)
             start = stop
         return _assemble(self.space, (), parts)
 
