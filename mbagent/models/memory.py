@@ -16,6 +16,10 @@ SOME_ROWS, SOME_TESTS = 2500, 1000
 """Transitions learned from and held out to look at a question such as this one."""
 
 
+PART = 2000
+"""Transitions looked at at once."""
+
+
 def better(logs: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
     """Whether log-probabilities [N] are higher than others, of the same transitions, by more than chance."""
     gain = logs - others
@@ -31,8 +35,17 @@ def following_steps(rows: TransitionBatch) -> tuple[NDArray[np.int64], NDArray[n
     """Numbers of the transitions that follow another in the same episode, and of those; episodes may be interleaved."""
     order = np.argsort(rows.episodes, kind="stable")
     earlier, later = order[:-1], order[1:]
-    same = (rows.episodes[later] == rows.episodes[earlier]) & (rows.states[later] == rows.next_states[earlier]).all(axis=1)
+    same = (rows.episodes[later] == rows.episodes[earlier]) & _follow(rows, later, earlier)
     return later[same], earlier[same]
+
+
+def _follow(rows: TransitionBatch, later: NDArray[np.int64], earlier: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which of the later transitions begin where the earlier ones end; looked at in parts."""
+    found = np.zeros(len(later), dtype=np.bool_)
+    for begin in range(0, len(later), PART):
+        part = slice(begin, begin + PART)
+        found[part] = (rows.before[later[part]] == rows.after[earlier[part]]).all(axis=1)
+    return found
 
 
 def steps_in_a_row(rows: TransitionBatch, most: int) -> tuple[TransitionBatch, TransitionBatch]:
