@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mbagent.spaces import FactoredSpace, PlaneLayout
-from mbagent.transitions import TransitionBatch
+from mbagent.transitions import TransitionBatch, TransitionDataset
 
 SOME_ROWS, SOME_TESTS = 2500, 1000
 """Transitions learned from and held out to look at a question such as this one."""
@@ -29,6 +29,16 @@ def better(logs: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
 def thinned(rows: TransitionBatch, most: int) -> TransitionBatch:
     """Evenly chosen transitions."""
     return rows.select(np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)) if len(rows) else rows
+
+
+def within(data: TransitionDataset, most: int) -> TransitionDataset:
+    """The dataset, or evenly chosen transitions of it, that have at most so many values of factors."""
+    n = max(1, most // max(1, len(data.cardinalities)))
+    if len(data) <= n:
+        return data
+    smaller = TransitionDataset(data.cardinalities, data.n_actions)
+    smaller.append(thinned(data.rows(), n))
+    return smaller
 
 
 def following_steps(rows: TransitionBatch) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

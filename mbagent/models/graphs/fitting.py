@@ -81,7 +81,7 @@ class _Table:
             self.since[-2] = since[-1]
         lone = np.flatnonzero(np.diff(layout.first) == 1)
         self.moving = lone[np.isin(layout.members[layout.first[lone]], list(moving))]
-        flags = np.stack([rows.terminated, events], axis=1).astype(np.int64)
+        flags = np.stack([rows.terminated, events], axis=1).astype(np.uint8)
         self.now = np.concatenate([unit_values(layout, rows.before), np.zeros_like(flags)], axis=1)
         self.then = np.concatenate([unit_values(layout, rows.after), flags], axis=1)
         first, self.pattern = distinct(rows.before, rows.actions)
@@ -102,7 +102,8 @@ class _Table:
 
     def seen(self, unit: int) -> Seen:
         """A unit's values in all rows."""
-        return Seen(self.pattern, self.rows.actions, self.now[:, unit], self.then[:, unit])
+        now, then = (values[:, unit].astype(np.int64) for values in (self.now, self.then))
+        return Seen(self.pattern, self.rows.actions, now, then)
 
     def kinds(self, seen: Ints) -> Ints:
         """Kind of each column, by some rows."""
@@ -113,9 +114,8 @@ class _Table:
         """The graphs; habits are those of the rows seen."""
         habits = []
         for unit, cardinality in enumerate(self.layout.outputs):
-            some = self.counting(unit, seen)
-            actions, now, then = self.rows.actions[some], self.now[some, unit], self.then[some, unit]
-            habits.append(habit_of(int(cardinality), self.layout.n_actions, actions, now, then))
+            some = self.seen(unit).select(self.counting(unit, seen))
+            habits.append(habit_of(int(cardinality), self.layout.n_actions, some.actions, some.now, some.then))
         return build(self.layout, asked, found, habits, still)
 
 

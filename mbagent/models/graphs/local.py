@@ -57,6 +57,7 @@ class LocalGraphModel(DecisionGraphModel):
                 "use DecisionGraphModel."
             )
         self.board, self.given, self.searched = space.planes, reach, 0
+        self.counted = 0
         self._forget(cards, reach or Reach())
 
     def _forget(self, cards: tuple[int, ...], reach: Reach) -> None:
@@ -89,6 +90,7 @@ class LocalGraphModel(DecisionGraphModel):
             progress(1.0)
         figures = {"nodes": float(len(self.local.graphs.column)), "couplings": float(len(self.local.couplings))}
         figures |= {"changed": float((since > 0).sum()), "searched": float(self.searched)}
+        figures["left out"] = float(len(rows) - self.counted)
         report = self._report((len(rows), len(held_out)), likelihood, exact, figures)
         memory = self._memory(train, held_out)
         report = replace(report, variables=variables, calibration=calibration, memory=memory)
@@ -159,7 +161,7 @@ class LocalGraphModel(DecisionGraphModel):
         """Graphs first, each cell for itself; then what is never on together, and what hangs on what others become."""
         local = self.local
         planes = PlaneTable(rows, self.board, local.cardinalities, local.columns, self.n_actions, since, in_pairs)
-        self.searched = len(planes.rows)
+        self.searched, self.counted = len(planes.rows), len(planes.every_action)
         graphs, asked, found = learn_channels(planes)
         self.local = replace(local, graphs=graphs, late=nothing_late(graphs), couplings=())
         self._instantiate((), ())

@@ -35,6 +35,12 @@ Bools: TypeAlias = NDArray[np.bool_]
 MOST_CELLS = 200_000_000
 """Entries of the table of columns that the search reads; of more transitions than that, some from all over are searched."""
 
+FEWEST_CHANGES = 50
+"""Cells of a channel that must have changed as another's did, before it is taken for a copy."""
+
+MOST_COUNTED = 1_000_000_000
+"""Values of cells that are gone through in all, a byte each before and after a step."""
+
 CHUNK = 50_000_000
 """Entries of the table that are made at once."""
 
@@ -44,13 +50,22 @@ def channel_layout(cardinalities: Sequence[int], n_actions: int) -> Layout:
     return lay_out(cardinalities, (), n_actions, ordinal=False)
 
 
+def _counted(rows: TransitionBatch) -> tuple[TransitionBatch, Ints]:
+    """The rows that are gone through, and their numbers."""
+    most = max(1, MOST_COUNTED // max(1, rows.before.shape[1]))
+    if len(rows) <= most:
+        return rows, np.arange(len(rows))
+    counted = np.linspace(0, len(rows) - 1, most).astype(np.int64)
+    return rows.select(counted), counted
+
+
 class PlaneTable:
     """Transitions of planes, as cells with their relative columns.
 
     Attributes:
         table: columns of the neighbourhood of all cells that look different, bool [looks, near].
         whole: whether it is of all transitions.
-        every: planes of all transitions and of their next states.
+        every: planes of all transitions and of their next states; of evenly chosen ones where that were over MOST_COUNTED.
 
     Args:
         rows: N transitions.
@@ -77,6 +92,8 @@ class PlaneTable:
         self.board, self.cardinalities, self.columns, self.n_actions = board, cardinalities, columns, n_actions
         self.n_cells = board.height * board.width
         self.since = np.zeros(len(cardinalities) + 1, dtype=np.int64) if since is None else since
+        rows, counted = _counted(rows)
+        self.since = np.searchsorted(counted, self.since)
         self.every = board.to_planes(rows.before), board.to_planes(rows.after)
         self.every_action, self.every_since = rows.actions, self.since
         known = known_columns(columns, *self.every)
@@ -123,7 +140,10 @@ class PlaneTable:
         return Seen(self.pattern, self.actions, now, then).select(self.cells_since(channel))
 
     def told_by(self, channel: int) -> Ints | None:
-        """Columns that alone tell what a channel becomes, see ``windows.told_by``; None where none do."""
+        """Columns that alone tell what a channel becomes, see ``windows.told_by``; None where none do, or it changed rarely."""
+        before, after = (planes[:, channel] for planes in self.every)
+        if (before != after).sum() < FEWEST_CHANGES:
+            return None
         return told_by(channel, self.columns, self.near, *self.every, self.every_action)
 
     def copying(self, channel: int, columns: Ints) -> tuple[list[Question], Bools]:

@@ -25,7 +25,7 @@ from mbagent.models.graphs.parents import flat_variables
 from mbagent.models.graphs.predictions import GraphPredictions
 from mbagent.models.graphs.recency import still_true_since
 from mbagent.models.graphs.units import coupled_layout, is_lone_bit, lay_out
-from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, steps_in_a_row, thinned, with_past
+from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, steps_in_a_row, thinned, with_past, within
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.transitions import TransitionBatch, TransitionDataset
 
@@ -37,6 +37,10 @@ FEWEST = 4
 
 ENOUGH, MOST_SPLITS = 5, 10
 """So many held-out rare events tell whether they are events at all; where one split has fewer, others follow, up to so many."""
+
+MOST_VALUES = 200_000_000
+"""Values of factors that are learned from at once, which takes up to some ten bytes each; of more transitions than have so
+many, evenly chosen ones are."""
 
 MOST_COUNTS = 20_000_000
 """Contexts times columns of a question about how far a factor moves."""
@@ -76,7 +80,8 @@ class DecisionGraphModel(GraphPredictions):
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel."""
-        began = time.perf_counter()
+        began, n_met = time.perf_counter(), len(data)
+        data = within(data, MOST_VALUES)
         rows, events, since = data.rows(), self._events(data, seed), self._since(data.rows())
         train, held_out, train_since = self._split(data, seed, since)
         if progress is not None:
@@ -92,7 +97,7 @@ class DecisionGraphModel(GraphPredictions):
         if progress is not None:
             progress(1.0)
         figures = {"nodes": float(len(self.fitted.usual.column)), "events": float(events.sum())}
-        figures["changed"] = float((since > 0).sum())
+        figures |= {"changed": float((since > 0).sum()), "left out": float(n_met - len(rows))}
         report = self._report((len(rows), len(held_out)), likelihood, exact, figures)
         memory = self._memory(train, held_out)
         report = replace(report, variables=variables, calibration=calibration, memory=memory)

@@ -139,9 +139,9 @@ def is_lone_bit(layout: Layout) -> Bools:
     return result
 
 
-def unit_values(layout: Layout, states: Factors) -> Ints:
-    """Value of each unit of factors, int64 [B, U - 2], in states [B, F]; in a group the first bit that is on counts."""
-    values = np.empty((len(states), len(layout.outputs) - 2), dtype=np.int64)
+def unit_values(layout: Layout, states: Factors) -> Factors:
+    """Value of each unit of factors, [B, U - 2], in states [B, F], as narrow as can be; in a group the first bit on counts."""
+    values = np.empty((len(states), len(layout.outputs) - 2), dtype=np.min_scalar_type(int(layout.outputs.max()) - 1))
     for unit in range(values.shape[1]):
         members = layout.members[layout.first[unit] : layout.first[unit + 1]]
         values[:, unit] = states[:, members[0]] if len(members) == 1 else states[:, members].argmax(axis=1)

@@ -220,7 +220,9 @@ def _look_around(columns: Ints, planes: Ints, rows: Ints, y: Ints, x: Ints, out:
             elif kind in (CELL, WRAP):
                 row, column = y[k] + columns[d, 3], x[k] + columns[d, 4]
                 inside = 0 <= row < height and 0 <= column < width
-                if inside == (kind == CELL):
+                if inside and kind == CELL:
+                    out[k, d] = planes[rows[k], columns[d, 1], row, column] == columns[d, 2]
+                elif not inside and kind == WRAP:
                     out[k, d] = planes[rows[k], columns[d, 1], row % height, column % width] == columns[d, 2]
 
 

@@ -33,6 +33,10 @@ WORTH = 10.0
 """Evidence, nats, that could be gained in a context at most, below which nothing is looked for in it."""
 
 
+LEAST = 100
+"""Cells of the more frequent outcome that are taken at least."""
+
+
 def zoom(planes: PlaneTable, asked: Sequence[Question], found: list[Search]) -> list[Search]:
     """Searches that go on in all transitions where some were searched; as they are where all were.
 
@@ -191,8 +195,8 @@ def _water_level(rarer: Sequence[Ints], most: int) -> int:
 def _sampled(each: _Followed, contexts: Bools, limit: int, begin: int) -> tuple[Ints, Search]:
     """Cells of some contexts, and a search of them; their rows are numbered from ``begin`` on.
 
-    Of each context's rarer outcome evenly chosen cells are taken, of the other up to three times as many; they weigh what
-    they stand for, as a multiple of what the rarer ones do.
+    Of each context's rarer outcome evenly chosen cells are taken, of the other three times as many and ``LEAST`` more; they
+    weigh what they stand for, as a multiple of what the rarer ones do.
     """
     numbers = np.where(contexts, np.cumsum(contexts) - 1, -1)
     inside = np.flatnonzero((each.context >= 0) & contexts[each.context])
@@ -204,7 +208,8 @@ def _sampled(each: _Followed, contexts: Bools, limit: int, begin: int) -> tuple[
     for number in range(int(contexts.sum())):
         outcomes = [order[ends[2 * number + e] : ends[2 * number + e + 1]] for e in (0, 1)]
         fewer = min(len(outcome) for outcome in outcomes)
-        taken = [min(len(outcome), limit if len(outcome) == fewer else 3 * limit) for outcome in outcomes]
+        most = min(fewer, limit)
+        taken = [min(len(outcome), most if len(outcome) == fewer else 3 * most + LEAST) for outcome in outcomes]
         stand = [len(outcome) / max(k, 1) for outcome, k in zip(outcomes, taken, strict=True)]
         for e, outcome in enumerate(outcomes):
             k = taken[e]

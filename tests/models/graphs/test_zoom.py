@@ -37,7 +37,8 @@ def likeliest(data: TransitionDataset, tests: TransitionBatch) -> tuple[LocalGra
     space = FactoredSpace(Maneuverer(size=4).observation_space)
     model = LocalGraphModel(space, 4, Reach(1))
     report = model.fit(data, seed=0)
-    assert ("searched" in report.log) and report.log["searched"] <= len(data)
+    assert 0 < report.log["searched"] <= len(data)
+    assert report.log["left out"] == 0
     return model, model.likeliest(tests.states, tests.actions)
 
 
