@@ -35,6 +35,9 @@ Bools: TypeAlias = NDArray[np.bool_]
 MOST_CELLS = 200_000_000
 """Entries of the table of columns that the search reads; of more transitions than that, some from all over are searched."""
 
+QUICK_CELLS = 50_000_000
+"""As MOST_CELLS, for a quick look that asks for single causes only."""
+
 FEWEST_CHANGES = 50
 """Cells of a channel that must have changed as another's did, before it is taken for a copy."""
 
@@ -65,6 +68,7 @@ class PlaneTable:
     Attributes:
         table: columns of the neighbourhood of all cells that look different, bool [looks, near].
         whole: whether it is of all transitions.
+        most_looks: rows that a table for a search may have.
         every: planes of all transitions and of their next states; of evenly chosen ones where that were over MOST_COUNTED.
 
     Args:
@@ -102,6 +106,7 @@ class PlaneTable:
         self.near, self.far, self.next_far = (
             known[which] for which in (here, np.isin(kind, (MEETING, ACTION)), kind == NEXT_MEETING)
         )
+        self.most_looks = (MOST_CELLS if in_pairs else QUICK_CELLS) // max(len(self.near), 1)
         self.table, self.pattern, taken = self._looks(self.every[0], rows.actions)
         self.whole = len(taken) == len(rows)
         self.rows = rows if self.whole else rows.select(taken)
@@ -114,7 +119,7 @@ class PlaneTable:
 
         Transitions from all over are taken as long as there is room.
         """
-        most, step = MOST_CELLS // max(len(self.near), 1), max(1, CHUNK // (self.n_cells * max(len(self.near), 1)))
+        most, step = self.most_looks, max(1, CHUNK // (self.n_cells * max(len(self.near), 1)))
         looks, n_parts = np.zeros((0, -(-len(self.near) // 8)), dtype=np.uint8), -(-len(planes) // step)
         pattern, taken = [np.zeros((0, self.n_cells), dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
         for number in range(n_parts):

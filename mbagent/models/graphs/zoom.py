@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mbagent.models.graphs.evidence import Head, Tables, columns_of, evidence_tables, evidences
 from mbagent.models.graphs.greedy import certainty, go_on
-from mbagent.models.graphs.looks import CHUNK, MOST_CELLS, PlaneTable
+from mbagent.models.graphs.looks import CHUNK, PlaneTable
 from mbagent.models.graphs.search import Search, Split
 from mbagent.models.graphs.units import Question
 from mbagent.models.graphs.windows import column_kinds, column_planes, values_at
@@ -51,7 +51,7 @@ def zoom(planes: PlaneTable, asked: Sequence[Question], found: list[Search]) -> 
     if planes.whole or not asked:
         return found
     followed = [_Followed(planes, question, search) for question, search in zip(asked, found, strict=True)]
-    most, certain = MOST_CELLS // max(len(planes.near), 1), certainty(found)
+    most, certain = planes.most_looks, certainty(found)
     for _ in range(ROUNDS if planes.in_pairs else 1):
         if not _round(planes, followed, most, certain):
             break

@@ -1,5 +1,6 @@
 """More transitions than can be searched at once: counted in parts, and searched where they disagree."""
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -7,7 +8,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from mbagent.models.graphs import LocalGraphModel, looks, zoom
+from mbagent import transitions
+from mbagent.models.graphs import DecisionGraphModel, LocalGraphModel, looks, zoom
+from mbagent.models.graphs import model as graph_model
 from mbagent.models.graphs.windows import NEXT, NEXT_MEETING, Reach, column_values, relative_columns, values_at
 from mbagent.spaces import FactoredSpace
 from mbagent.transitions import TransitionBatch, TransitionDataset
@@ -28,8 +31,9 @@ def test_columns_of_some_cells_are_those_of_all() -> None:
 
 @pytest.fixture
 def little_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("MOST_CELLS", "QUICK_CELLS"):
+        monkeypatch.setattr(looks, name, 60_000)
     for module in (looks, zoom):
-        monkeypatch.setattr(module, "MOST_CELLS", 60_000)
         monkeypatch.setattr(module, "CHUNK", 100_000)
 
 
@@ -96,3 +100,30 @@ def test_a_past_is_copied_and_tells_when_things_move() -> None:
     found, _ = model.likeliest(states, actions)
     late = np.arange(len(rows)) % 40 >= 3  # before, the past shows the first observation again and again
     assert (found == after).all(axis=1)[late].all()
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_rows_in_files_teach_the_same(flat: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transitions, "_MAPPED", 1000)
+    space = FactoredSpace(Maneuverer(size=3).observation_space)
+    rows, fitted = played(Maneuverer(size=3), 400, 20).rows(), []
+    for folder in (None, tmp_path):
+        data = TransitionDataset(space.cardinalities, 4, folder)
+        for part in rows.parts(150):
+            data.append(part)
+        model = DecisionGraphModel(space.cardinalities, 4) if flat else LocalGraphModel(space, 4, Reach(1))
+        model.fit(data, seed=0)
+        fitted.append(model.state_dict())
+    assert all(np.array_equal(fitted[0][name], fitted[1][name]) for name in fitted[0])
+
+
+def test_what_was_left_out_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(graph_model, "MOST_VALUES", 27 * 200)
+    monkeypatch.setattr(looks, "MOST_COUNTED", 27 * 150)
+    space, data = FactoredSpace(Maneuverer(size=3).observation_space), played(Maneuverer(size=3), 400, 20)
+    report = DecisionGraphModel(space.cardinalities, 4).fit(data, seed=0)
+    assert report.log["left out"] == 200
+    assert report.n_train == 200
+    report = LocalGraphModel(space, 4, Reach(1)).fit(data, seed=0)
+    assert report.log["left out"] == 250
+    assert report.n_train == 400
