@@ -9,7 +9,6 @@ outcomes first.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -33,7 +32,7 @@ WORTH = 10.0
 """Evidence, nats, that could be gained in a context at most, below which nothing is looked for in it."""
 
 
-LEAST = 100
+LEAST = 300
 """Cells of the more frequent outcome that are taken at least."""
 
 
@@ -52,7 +51,7 @@ def zoom(planes: PlaneTable, asked: Sequence[Question], found: list[Search]) -> 
         return found
     followed = [_Followed(planes, question, search) for question, search in zip(asked, found, strict=True)]
     most, certain = planes.most_looks, certainty(found)
-    for _ in range(ROUNDS if planes.in_pairs else 1):
+    for _ in range(ROUNDS):
         if not _round(planes, followed, most, certain):
             break
     return [each.search() for each in followed]
@@ -117,111 +116,94 @@ class _Followed:
         result: Bools = ~self.closed & (-evidences(self.e, self.n, tables) > WORTH) & (self.e > 0) & (self.e < self.n)
         return result
 
-    def graft(self, local: Search, begun: int, contexts: Bools, start: Ints, near: Ints) -> bool:
-        """Takes over what a search in some contexts found; whether it found anything.
+    def graft(self, found: Sequence[Search], contexts: Ints, near: Ints) -> bool:
+        """Takes over what was found in some contexts; whether anything was.
 
         Args:
-            local: the search, whose contexts began as the numbers of ``contexts``, and whose columns are numbers of ``near``.
-            begun: number of its splits that were known before.
-            contexts: bool [C].
-            start: context in which each of its rows began, int64 [R].
+            found: a search of each, whose columns are numbers of ``near``.
+            contexts: ascending, int64 [K].
             near: columns.
         """
-        new, size = local.splits[begun:], len(self.action)
-        kept, chosen = np.flatnonzero(~contexts), np.flatnonzero(contexts)
-        if not new:
-            self.closed |= contexts
-            return False
-        order = np.empty(size, dtype=np.int64)
-        order[kept], order[chosen] = np.arange(len(kept)), len(kept) + np.arange(len(chosen))
-        splits = [Split(-1, order, order, 0.0)]
-        for split in new:
-            off, on = (np.concatenate([np.arange(len(kept)), len(kept) + side]) for side in (split.off, split.on))
-            splits.append(replace(split, column=int(near[split.column]) if split.column >= 0 else -1, off=off, on=on))
-        pieces = np.unique(np.stack([start, local.head.context]), axis=1)
-        whole = np.bincount(pieces[0], minlength=len(chosen)) == 1
-        closed = np.ones(len(local.head.action), dtype=np.bool_)
-        closed[pieces[1][~whole[pieces[0]]]] = False
-        self.closed = np.concatenate([self.closed[kept], closed])
-        self.action = np.concatenate([self.action[kept], local.head.action])
-        self.value = np.concatenate([self.value[kept], local.head.value])
-        self.typical = np.concatenate([self.typical[kept], local.typical])
-        self.follow(splits)
-        return True
+        splits, rates = [], self.e / np.maximum(self.n, 1)
+        for context, search in zip(contexts[::-1], found[::-1], strict=True):  # those before keep their numbers
+            if not search.splits:
+                self.closed[context] = True
+                continue
+            size, head = len(self.action), search.head
+            kept = np.delete(np.arange(size), context)
+            order = np.empty(size, dtype=np.int64)
+            order[kept], order[context] = np.arange(size - 1), size - 1
+            splits.append(Split(-1, order, order, 0.0))
+            for split in search.splits:
+                off, on = (np.concatenate([np.arange(size - 1), size - 1 + side]) for side in (split.off, split.on))
+                splits.append(Split(int(near[split.column]) if split.column >= 0 else -1, off, on, split.gain))
+            self.action = np.concatenate([self.action[kept], head.action])
+            self.value = np.concatenate([self.value[kept], head.value])
+            self.typical = np.concatenate([self.typical[kept], np.full(len(head.action), rates[context])])
+            self.closed = np.concatenate([self.closed[kept], np.zeros(len(head.action), dtype=np.bool_)])
+        if splits:
+            self.follow(splits)
+        return bool(splits)
 
 
 def _round(planes: PlaneTable, followed: Sequence[_Followed], most: int, certain: float) -> bool:
     """Searches on in the contexts in which cells disagree; whether any split was found."""
     tables = evidence_tables(max(int(each.n.max(initial=0)) for each in followed) + 1, certain)
-    opened = [each.open_contexts(tables) for each in followed]
-    limit = _water_level([np.minimum(f.e, f.n - f.e)[o] for f, o in zip(followed, opened, strict=True)], most)
-    position, chosen = np.full(len(planes.columns), -1), []
-    position[planes.near] = np.arange(len(planes.near))
-    searches: list[Search] = []
-    begun = 0
+    opened = [np.flatnonzero(each.open_contexts(tables)) for each in followed]
+    limit = _water_level([np.minimum(f.e, f.n - f.e)[o] for f, o in zip(followed, opened, strict=True)], most // 4)
+    chosen: list[Ints] = []
+    searches: list[list[Search]] = []
     for each, contexts in zip(followed, opened, strict=True):
-        cells, search = _sampled(each, contexts, limit, begun)
-        search.splits = [replace(s, column=int(position[s.column]) if s.column >= 0 else -1) for s in each.splits]
-        chosen.append(cells)
-        searches.append(search)
-        begun += len(cells)
-    if begun == 0:
+        searches.append(_sampled(each, contexts, limit, chosen))
+    every = [search for some in searches for search in some]
+    if not every:
         return False
     rows, cells = np.divmod(np.concatenate(chosen), planes.n_cells)
     width = planes.board.width
     table = values_at(planes.columns[planes.near], planes.every[0], planes.every_action, rows, cells // width, cells % width)
-    starts, known = [search.head.context for search in searches], [len(search.splits) for search in searches]
-    weights = max(int(search.head.seen.sum()) for search in searches) + 1
     kinds = column_kinds(planes.columns)[planes.near]
-    go_on(searches, table, columns_of(table), kinds, planes.n_actions, evidence_tables(weights, certain), planes.in_pairs)
-    grown = [
-        each.graft(search, n, contexts, start, planes.near)
-        for each, search, n, contexts, start in zip(followed, searches, known, opened, starts, strict=True)
-    ]
+    tables = evidence_tables(len(table) + 1, certain)
+    go_on(every, table, columns_of(table), kinds, planes.n_actions, tables, planes.in_pairs)
+    grown = [each.graft(some, contexts, planes.near) for each, some, contexts in zip(followed, searches, opened, strict=True)]
     return any(grown)
 
 
-def _water_level(rarer: Sequence[Ints], most: int) -> int:
-    """How many cells of the rarer outcome a context may have, so that all have ``most`` cells, half of each outcome."""
+def _water_level(rarer: Sequence[Ints], room: int) -> int:
+    """How many cells of its rarer outcome a context may have, where there is room for so many in all."""
     counts = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *rarer]))
     below = np.concatenate([[0], np.cumsum(counts)])
-    room = most // 4  # the more frequent outcome gets three times as many
     for i, count in enumerate(counts):
         if below[i] + count * (len(counts) - i) > room:
             return max(1, int((room - below[i]) // (len(counts) - i)))
     return room
 
 
-def _sampled(each: _Followed, contexts: Bools, limit: int, begin: int) -> tuple[Ints, Search]:
-    """Cells of some contexts, and a search of them; their rows are numbered from ``begin`` on.
+def _sampled(each: _Followed, contexts: Ints, limit: int, chosen: list[Ints]) -> list[Search]:
+    """A search of some cells of each of some contexts; the cells are added to ``chosen``, and their rows numbered as there.
 
-    Of each context's rarer outcome evenly chosen cells are taken, of the other three times as many and ``LEAST`` more; they
-    weigh what they stand for, as a multiple of what the rarer ones do.
+    Of the rarer outcome evenly chosen cells are taken, of the other three times as many and ``LEAST`` more. They all weigh the
+    same: that a column is on in none of the few that were taken says little of all that they stand for. What tells outcomes
+    apart can be learned from such cells, how often they come cannot; so each context is searched for itself.
     """
-    numbers = np.where(contexts, np.cumsum(contexts) - 1, -1)
-    inside = np.flatnonzero((each.context >= 0) & contexts[each.context])
-    group = 2 * numbers[each.context[inside]] + each.came()[inside]
-    order = np.argsort(group.astype(np.int32), kind="stable")
-    ends = np.searchsorted(group[order], np.arange(2 * int(contexts.sum()) + 1))
-    none = np.zeros(0, dtype=np.int64)
-    cells, weights, came, start = [none], [none], [none], [none]
-    for number in range(int(contexts.sum())):
-        outcomes = [order[ends[2 * number + e] : ends[2 * number + e + 1]] for e in (0, 1)]
-        fewer = min(len(outcome) for outcome in outcomes)
-        most = min(fewer, limit)
-        taken = [min(len(outcome), most if len(outcome) == fewer else 3 * most + LEAST) for outcome in outcomes]
-        stand = [len(outcome) / max(k, 1) for outcome, k in zip(outcomes, taken, strict=True)]
-        for e, outcome in enumerate(outcomes):
-            k = taken[e]
-            cells.append(inside[outcome[np.linspace(0, len(outcome) - 1, k).astype(np.int64)]])
-            weights.append(np.full(k, max(1, round(stand[e] / min(stand)))))
-            came.append(np.full(k, e))
-            start.append(np.full(k, number))
-    chosen, seen, arrived, context = (np.concatenate(parts) for parts in (cells, weights, came, start))
-    rows = begin + np.arange(len(chosen))
-    search = Search(Head(rows, seen, seen * arrived, context, each.action[contexts], each.value[contexts]))
-    search.typical = each.typical[contexts]
-    return chosen, search
+    number = np.full(len(each.action) + 1, -1, dtype=np.int32)  # the last one: of cells that are not asked
+    number[contexts] = np.arange(len(contexts))
+    inside = np.flatnonzero(number[each.context] >= 0)
+    group = 2 * number[each.context[inside]] + each.came()[inside]
+    order = np.argsort(group, kind="stable")
+    ends = np.searchsorted(group[order], np.arange(2 * len(contexts) + 1))
+    begun, searches = sum(len(cells) for cells in chosen), []
+    for k, context in enumerate(contexts):
+        outcomes = [inside[order[ends[2 * k + e] : ends[2 * k + e + 1]]] for e in (0, 1)]
+        rarer = min(limit, *(len(outcome) for outcome in outcomes))
+        sizes = [min(len(o), 3 * rarer + LEAST if len(o) == max(map(len, outcomes)) else rarer) for o in outcomes]
+        taken = [o[np.linspace(0, len(o) - 1, n).astype(np.int64)] for o, n in zip(outcomes, sizes, strict=True)]
+        chosen += taken
+        rows, came = begun + np.arange(sum(sizes)), np.repeat([0, 1], sizes)
+        begun += sum(sizes)
+        start = np.zeros(len(rows), dtype=np.int64)
+        own = slice(int(context), int(context) + 1)
+        searches.append(Search(Head(rows, start + 1, came, start, each.action[own], each.value[own])))
+    return searches
 
 
 @compiled
