@@ -106,7 +106,7 @@ def minatar(seed: int, full: bool) -> list[Row]:
     """Share of frames of new episodes that are foretold exactly, after 50,000 steps.
 
     Freeway with a history of five steps has 5,700 factors, and a fit takes minutes. Five steps are what its slowest cars take;
-    the chicken's timer at the lower border could be told in about 99% of frames, as steps down that lead nowhere wind it up unseen.
+    the chicken's timer at the lower border could be told in about 99% of frames: steps down that lead nowhere set it unseen.
     """
     steps, rows = 50_000 if full else 5000, []
     for name, k in GAMES.items():
