@@ -143,7 +143,12 @@ def toy_text_model(env: gym.Env[Any, Any]) -> tuple[TableModel, Callable[[Any, A
     following, over, probabilities = zip(*rows, strict=True)
     start = np.flatnonzero(np.asarray(unwrapped.initial_state_distrib) > 0)
     model = TableModel(
-        np.asarray(offsets), np.asarray(following), np.asarray(over), np.asarray(probabilities, dtype=np.float64), n_actions, start
+        np.asarray(offsets),
+        np.asarray(following),
+        np.asarray(over),
+        np.asarray(probabilities, dtype=np.float64),
+        n_actions,
+        start,
     )
 
     def reward_fn(obs: Any, action: Any, next_obs: Any) -> Floats:
