@@ -58,7 +58,7 @@ class TableModel(BaseTransitionModel):
         lengths = {len(next_states), len(terminated), len(probabilities), int(offsets[-1])}
         if rest or len(lengths) > 1 or (np.diff(offsets) < 1).any() or not np.allclose(totals, 1.0):
             raise ValueError(
-                "A table needs outcomes for every (state, action), with one next state, end and probability each, which sum to one."
+                "A table needs outcomes for every (state, action), with one next state, end and probability each, summing to one."
             )
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
