@@ -1,4 +1,4 @@
-"""A world known as a table: every (state, action)'s outcomes with their probabilities, as Gymnasium's toy_text environments hold."""
+"""A world known as a table: the outcomes of every (state, action), as Gymnasium's toy_text environments hold them."""
 
 from __future__ import annotations
 

@@ -13,14 +13,14 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent_envs._compiled import borrowed, compiled
+from mbagent_envs._compiled import borrowed, compiled, inlined
 from mbagent_envs.random_keys import derive_one, mix
 
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
 Bools: TypeAlias = NDArray[np.bool_]
 
-DEPTH = 4
+DEPTH = 3
 """Steps of a simulation, at most, where nothing else is said."""
 
 MOST_COUNTED = 1 << 14
@@ -91,9 +91,9 @@ def known_machine(
     pair = np.repeat(np.arange(len(first) - 1), np.diff(first))
     total = np.cumsum(probabilities)
     before = np.concatenate([[0.0], total])[first[:-1]]
-    income = np.bincount(pair, weights=probabilities * rewards, minlength=len(first) - 1).reshape(-1, n_actions)
+    income: Floats = np.bincount(pair, weights=probabilities * rewards, minlength=len(first) - 1).astype(np.float64)
     weight = np.where(over, 0.0, gamma * probabilities)
-    return KnownMachine(first, following, total - before[pair], weight, income, first_value, over)
+    return KnownMachine(first, following, total - before[pair], weight, income.reshape(-1, n_actions), first_value, over)
 
 
 _N = np.arange(MOST_COUNTED, dtype=np.float64)
@@ -115,7 +115,7 @@ def search_machine(
         c_uct: weight of exploration, in units of the range of the values of the root's actions.
     """
     n_actions = machine.income.shape[1]
-    values, visits = np.empty((len(roots), n_actions)), np.empty((len(roots), n_actions), dtype=np.int64)
+    values, visits = np.empty((len(roots), n_actions)), np.zeros((len(roots), n_actions), dtype=np.int64)
     steps = _search_all(machine, roots, n_simulations, np.uint64(seed), depth, c_uct, BOUND_TOP, BOUND_BELOW, values, visits)
     return Searched(values, visits, steps)
 
@@ -149,13 +149,14 @@ def _search_all(
         _meet(root, m, q, v, n, met)
         for _ in range(n_simulations):
             state, taken = _simulate(root, state, depth, c_uct, m, top, below, q, v, n, met, path)
+            visits[r, path[0] - root * n_actions] += 1
             steps += taken
         for a in range(n_actions):
-            values[r, a], visits[r, a] = _worth(root, a, m.first, m.following, m.weight, m.income, v), n[root, a]
+            values[r, a] = _worth(root, a, m.first, m.following, m.weight, m.income, v)
     return steps + 0 * len(owned[1])  # what is lent must live until here
 
 
-@compiled
+@inlined
 def _worth(s: int, a: int, first: Ints, following: Ints, weight: Floats, income: Floats, v: Floats) -> float:
     """Value of an action by those of its successors."""
     total = income[s, a]
@@ -165,7 +166,7 @@ def _worth(s: int, a: int, first: Ints, following: Ints, weight: Floats, income:
     return float(total)
 
 
-@compiled
+@inlined
 def _meet(s: int, m: KnownMachine, q: Floats, v: Floats, n: Ints, met: Ints) -> None:
     """Values a state that no simulation has met before by its successors' first values."""
     best = -np.inf
@@ -177,7 +178,7 @@ def _meet(s: int, m: KnownMachine, q: Floats, v: Floats, n: Ints, met: Ints) -> 
     met[s] = 1
 
 
-@compiled
+@inlined
 def _simulate(
     root: int,
     state: np.uint64,
