@@ -179,6 +179,30 @@ def _meet(s: int, m: KnownMachine, q: Floats, v: Floats, n: Ints, met: Ints) -> 
 
 
 @inlined
+def _best_bound(s: int, scale: float, below: Floats, q: Floats, n: Ints) -> int:
+    """The action with the greatest upper confidence bound."""
+    best, chosen = -np.inf, 0
+    for a in range(q.shape[1]):
+        score = q[s, a] + scale * below[min(n[s, a], MOST_COUNTED - 1)]
+        if score > best:
+            best, chosen = score, a
+    return chosen
+
+
+@inlined
+def _back_up(path: Ints, length: int, first: Ints, following: Ints, weight: Floats, income: Floats, q: Floats, v: Floats) -> None:
+    """Bellman backups of the (state, action) pairs of a simulation, the last one first."""
+    for i in range(length - 1, -1, -1):
+        s = path[i] // q.shape[1]
+        a = path[i] - s * q.shape[1]
+        q[s, a] = _worth(s, a, first, following, weight, income, v)
+        best = q[s, 0]
+        for b in range(1, q.shape[1]):
+            best = max(best, q[s, b])
+        v[s] = best
+
+
+@inlined
 def _simulate(
     root: int,
     state: np.uint64,
@@ -200,11 +224,7 @@ def _simulate(
         low, high = min(low, q[root, a]), max(high, q[root, a])
     spread, s, length = c_uct * (high - low), root, 0
     while length < depth:
-        scale, best, chosen = spread * top[min(met[s], MOST_COUNTED - 1)], -np.inf, 0
-        for a in range(n_actions):
-            score = q[s, a] + scale * below[min(n[s, a], MOST_COUNTED - 1)]
-            if score > best:
-                best, chosen = score, a
+        chosen = _best_bound(s, spread * top[min(met[s], MOST_COUNTED - 1)], below, q, n)
         n[s, chosen] += 1
         met[s] += 1
         pair = s * n_actions + chosen
@@ -221,12 +241,5 @@ def _simulate(
         if met[s] == 0:
             _meet(s, m, q, v, n, met)
             break
-    for i in range(length - 1, -1, -1):
-        s = path[i] // n_actions
-        a = path[i] - s * n_actions
-        q[s, a] = _worth(s, a, first, following, weight, income, v)
-        best = q[s, 0]
-        for b in range(1, n_actions):
-            best = max(best, q[s, b])
-        v[s] = best
+    _back_up(path, length, first, following, weight, income, q, v)
     return state, length
