@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,7 +60,7 @@ class _Search:
         settings = self.settings = planner.settings
         rollouts = settings.leaf_values == "rollouts"
         prior = 0.0 if rollouts else settings.prior_visits
-        key = derive(settings.seed, _SEARCH_SALT)[0]
+        key = _key(settings.seed, 0)
         self.rules = Rules(settings.gamma, settings.c_uct, prior, rollouts, settings.backup == "mean", key)
         spread, n_actions = solution.v[roots], graph.model.n_actions
         self.tables = Tables(
@@ -93,7 +95,7 @@ class _Search:
         n, n_widened = begin_wave(graph.arrays, self.roots, self.tables, rules, done, paths, leaves)
         n_nodes, n_edges, first = len(graph), graph.n_edges, paths.leaves.size
         draws = self.settings.n_samples if rules.rollouts else LEAF_SAMPLES
-        graph.expand(leaves[:n], draws, int(derive(self.settings.seed, _SEARCH_SALT, done + 1)[0]))
+        graph.expand(leaves[:n], draws, int(_key(self.settings.seed, done + 1)))
         self._make_room()
         self.tables.rewards[n_edges : graph.n_edges] = score_edges(graph, self.planner._known_goal(), n_edges)
         ends = self._rollouts(paths, done) if rules.rollouts else np.empty(paths.ends.shape)
@@ -120,6 +122,13 @@ class _Search:
         model, goal = self.planner._known_model(), self.planner._known_goal()
         values[alive] = random_returns(model, goal, states, keys, settings.horizon, settings.gamma)
         return values
+
+
+@lru_cache(maxsize=4096)
+def _key(seed: int, wave: int) -> np.uint64:
+    """Key of the search's luck (0), and of what the wave after ``wave - 1`` simulations imagines."""
+    key: np.uint64 = (derive(seed, _SEARCH_SALT) if wave == 0 else derive(seed, _SEARCH_SALT, wave))[0]
+    return key
 
 
 def _longer(table: NDArray[np.float64], size: int) -> Floats:
