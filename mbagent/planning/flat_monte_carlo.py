@@ -6,9 +6,12 @@ import numpy as np
 
 from mbagent.models.base import States, TransitionModel
 from mbagent.models.forecasts import DirectForecastModel
+from mbagent.models.state_graph import StateGraph
+from mbagent.planning.foresight import Foresight
 from mbagent.planning.goal import Goal
 from mbagent.planning.planner import Plan, PlannerSettings, best_actions
 from mbagent.planning.rollouts import forecast_returns, random_returns
+from mbagent.planning.value_iteration import score_edges
 from mbagent_envs.random_keys import derive
 
 
@@ -56,6 +59,16 @@ class FlatMonteCarlo:
         returns = returns.reshape(shape)
         values = returns.mean(axis=2) if settings.choice == "mean" else returns.max(axis=2)
         return Plan(best_actions(values), values, np.full(shape[:2], float(each)))
+
+    def foresee(self, root: States) -> Foresight:
+        """What the plan from one root [1, F] rests on; as there is no behaviour but random play, futures are one step long."""
+        plan, model, goal = self.plan(root), self._model, self._goal
+        assert model is not None
+        assert goal is not None  # ``plan`` has seen to both
+        graph = StateGraph(model)
+        node = graph.add(root, np.zeros(1, dtype=np.int64))
+        graph.expand(node, self.settings.n_samples, self.settings.seed)
+        return Foresight(plan, graph, int(node[0]), score_edges(graph, goal), np.full(len(graph), -1, dtype=np.int64))
 
 
 def direct_model(model: TransitionModel) -> DirectForecastModel:

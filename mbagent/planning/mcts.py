@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from mbagent.models.base import Floats, States
 from mbagent.models.state_graph import StateGraph
-from mbagent.planning.machine_planner import MachinePlanner
+from mbagent.planning.foresight import Foresight
+from mbagent.planning.machine_planner import Imagined, MachinePlanner
 from mbagent.planning.planner import Plan, best_actions
 from mbagent.planning.rollouts import random_returns
 from mbagent.planning.tree import Ints, Paths, empty_paths
@@ -37,17 +38,26 @@ class MctsPlanner(MachinePlanner):
         """See Planner."""
         if self.settings.leaf_values == "machine":
             return super().plan(roots)
+        found = self._imagine(roots)
+        return Plan(best_actions(found.scores), found.solution.q[found.nodes], found.visits)
+
+    def foresee(self, root: States) -> Foresight:
+        """See MachinePlanner."""
+        return super().foresee(root) if self.settings.leaf_values == "machine" else self._foresight(self._imagine(root), 0)
+
+    def _imagine(self, roots: States) -> Imagined:
+        """Searches from each root [R, F]."""
+        begin = self._lookahead if self.settings.leaf_values == "machine" else self._bare_roots
+        return _Search(self, *begin(roots)).run()
+
+    def _bare_roots(self, roots: States) -> tuple[StateGraph, Values, Ints]:
+        """As ``_lookahead``: the roots with their successors, all worth nothing yet."""
         graph = self._empty_graph()
         nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
         graph.expand(nodes, self.settings.n_samples, self.settings.seed)
         nothing = np.zeros((len(graph), graph.model.n_actions))
         rewards = score_edges(graph, self._known_goal())
-        solution = Values(nothing[:, 0].copy(), nothing, rewards, np.zeros(len(roots)))
-        values, visits, scores = self._search(graph, solution, nodes)
-        return Plan(best_actions(scores), values, visits)
-
-    def _search(self, graph: StateGraph, solution: Values, nodes: Ints) -> tuple[Floats, Floats, Floats]:
-        return _Search(self, graph, solution, nodes).run()
+        return graph, Values(nothing[:, 0].copy(), nothing, rewards, np.zeros(len(roots))), nodes
 
 
 class _Search:
@@ -67,8 +77,8 @@ class _Search:
         )  # fmt: skip
         measure_spans(graph.arrays, roots, self.tables)
 
-    def run(self) -> tuple[Floats, Floats, Floats]:
-        """Runs all simulations; returns (values, visits, scores) [R, A] of the roots."""
+    def run(self) -> Imagined:
+        """Runs all simulations."""
         settings, done = self.settings, 0
         wave = min(settings.wave, settings.num_simulations)
         paths, leaves = empty_paths(len(self.roots), wave, settings.horizon), np.empty(2 * len(self.roots) * wave, dtype=np.int64)
@@ -78,14 +88,16 @@ class _Search:
                 paths = empty_paths(len(self.roots), wave, settings.horizon)
             self._wave(paths, leaves, done)
             done += wave
-        visits, graph = self.tables.root_visits, self.graph
-        if settings.backup == "mean":
-            values = self.tables.q[self.roots]
-            return values, visits, visits + 1e-6 * _unit(values)
-        n, m, t = len(graph), graph.n_edges, self.tables
+        return self._result()
+
+    def _result(self) -> Imagined:
+        graph, roots, t = self.graph, self.roots, self.tables
+        n, m, visits = len(graph), graph.n_edges, self.tables.root_visits
         solution = Values(t.v[:n], t.q[:n], t.rewards[:m], t.frontier)
-        settle(graph, solution, settings.gamma, FINAL_SWEEPS)
-        return solution.q[self.roots], visits, break_ties(graph, solution.q, self.roots, settings.gamma)
+        if self.settings.backup == "mean":
+            return Imagined(graph, roots, solution, visits, visits + 1e-6 * _unit(t.q[roots]), t.visits[:n])
+        settle(graph, solution, self.settings.gamma, FINAL_SWEEPS)
+        return Imagined(graph, roots, solution, visits, break_ties(graph, solution.q, roots, self.settings.gamma))
 
     def _wave(self, paths: Paths, leaves: Ints, done: int) -> None:
         """A wave of simulations: one call of the model, one of the goal."""

@@ -105,7 +105,10 @@ class Plan:
 
 
 class Planner(Protocol):
-    """Chooses actions by imagining with a model; the outcome is a pure function of (settings, model, goal, root)."""
+    """Chooses actions by imagining with a model; the outcome is a pure function of (settings, model, goal, root).
+
+    One that can also show what a plan rests on has the method of ``foresight.ForeseeingPlanner``.
+    """
 
     def __init__(self, settings: PlannerSettings) -> None:
         """Takes the settings; a model and a goal must follow."""
