@@ -66,6 +66,7 @@ class ModelLearningAgent(SavableAlgorithm):
         exploration: "auto" or "random".
         gamma: discount of a step when planning.
         num_simulations: simulations for each decision.
+        time_budget: seconds for each decision instead (see PlannerSettings), or None.
         horizon: steps a simulation looks ahead, at most.
         policy_kwargs: further PlannerSettings, by name.
         stats_window_size: episodes that rollout figures in the log average over.
@@ -99,6 +100,7 @@ class ModelLearningAgent(SavableAlgorithm):
         exploration: str | Exploration = "auto",
         gamma: float = 0.99,
         num_simulations: int = 64,
+        time_budget: float | None = None,
         horizon: int = 20,
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
@@ -126,7 +128,7 @@ class ModelLearningAgent(SavableAlgorithm):
             raise TypeError(f"policy must be a planner policy such as 'MctsPolicy', got {self.policy_class.__name__}.")
         self.model_name = check_model(model)
         self.exploration_name = check_exploration(exploration)
-        self.gamma, self.num_simulations, self.horizon = gamma, num_simulations, horizon
+        self.gamma, self.num_simulations, self.time_budget, self.horizon = gamma, num_simulations, time_budget, horizon
         self.fit_report: FitReport | None = None
         self._custom_reward = reward
         self._planning_seed = seed if seed is not None else int(np.random.SeedSequence().generate_state(1)[0] >> 1)
@@ -147,7 +149,7 @@ class ModelLearningAgent(SavableAlgorithm):
         return self.policy.transition_model
 
     def _settings(self) -> PlannerSettings:
-        own: dict[str, Any] = {"num_simulations": self.num_simulations, "gamma": self.gamma, "horizon": self.horizon}
+        own = {name: getattr(self, name) for name in ("num_simulations", "time_budget", "gamma", "horizon")}
         known = sorted(set(PlannerSettings.__dataclass_fields__) - {*own, "seed"})
         unknown = sorted(set(self.policy_kwargs) - set(known))
         if unknown:

@@ -129,7 +129,8 @@ def explain(policy: PlannerPolicy, observation: Any, n_futures: int = 3, n_steps
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
             raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")
     state = _single_state(policy, observation)
-    settings = policy.settings
+    # A deadline, or the last decision's tree, would make two explanations of one observation differ.
+    settings = replace(policy.settings, time_budget=None, reuse_tree=False)
     found = _foresee(_planner(policy, settings), state)
     others = _other_values(policy, settings if found.machine_states else replace(settings, max_states=1), state)
     values = np.concatenate([found.plan.values, *(plan_values for plan_values, _ in others)])

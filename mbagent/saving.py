@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 SETTINGS = (
     "gamma",
     "num_simulations",
+    "time_budget",
     "horizon",
     "policy_kwargs",
     "stats_window_size",
