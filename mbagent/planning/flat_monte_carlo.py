@@ -43,7 +43,7 @@ class FlatMonteCarlo:
     def plan(self, roots: States) -> Plan:
         """See Planner. The simulations are shared out evenly over the actions.
 
-        With a time budget there are rounds of ``num_simulations`` until the next would not be done in time.
+        With a time budget there are rounds of ``wave`` simulations until the next would not be done in time.
         """
         if self._model is None or self._goal is None:
             raise RuntimeError("The planner has no model or no goal yet; call set_model and set_goal first.")
@@ -66,7 +66,7 @@ class FlatMonteCarlo:
         assert model is not None
         assert goal is not None  # ``plan`` has seen to both
         n_actions = model.n_actions
-        each = max(1, settings.num_simulations // n_actions)
+        each = max(1, (settings.num_simulations if settings.time_budget is None else settings.wave) // n_actions)
         rows = np.repeat(np.arange(len(roots)), n_actions * each)
         actions = np.tile(np.repeat(np.arange(n_actions), each), len(roots))
         # Simulation k meets the same luck under every action.
