@@ -6,6 +6,7 @@ Importing this package registers the games ``mbagent/GeyserRunner-v0``, ``mbagen
 
 import mbagent_envs
 from mbagent.agent import ModelLearningAgent
+from mbagent.explanations import Explanation, Future, Step
 from mbagent.planning.planner import PlannerSettings
 from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
 from mbagent.rewards import RewardFn
@@ -16,13 +17,16 @@ __version__ = "0.1.0"
 
 __all__ = [
     "ActionEnumeration",
+    "Explanation",
     "FactoredSpace",
     "FlatMonteCarloPolicy",
+    "Future",
     "MctsPolicy",
     "ModelLearningAgent",
     "PlannerPolicy",
     "PlannerSettings",
     "RewardFn",
+    "Step",
     "TransitionBatch",
     "TransitionDataset",
     "ValueIterationPolicy",

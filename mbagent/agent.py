@@ -11,7 +11,6 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
 from mbagent.arguments import (
@@ -23,6 +22,7 @@ from mbagent.arguments import (
     check_timesteps,
 )
 from mbagent.experience import ExperienceRecorder, distinct_rows
+from mbagent.explanations import Explanation, explain
 from mbagent.exploration import EXPLORATIONS, Exploration
 from mbagent.goals import GoalBook
 from mbagent.learned_reward import LearnedReward
@@ -30,7 +30,7 @@ from mbagent.models.base import FitReport, TransitionModel
 from mbagent.models.factory import build_model
 from mbagent.planning.planner import PlannerSettings
 from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
-from mbagent.reporting import fit_progress, log_fit
+from mbagent.reporting import fit_progress, log_fit, log_rollout
 from mbagent.rewards import RewardFn
 from mbagent.saving import SavableAlgorithm
 from mbagent.spaces import ActionEnumeration, FactoredSpace
@@ -66,6 +66,7 @@ class ModelLearningAgent(SavableAlgorithm):
         exploration: "auto" or "random".
         gamma: discount of a step when planning.
         num_simulations: simulations for each decision.
+        time_budget: seconds for each decision instead (see PlannerSettings), or None.
         horizon: steps a simulation looks ahead, at most.
         policy_kwargs: further PlannerSettings, by name.
         stats_window_size: episodes that rollout figures in the log average over.
@@ -99,6 +100,7 @@ class ModelLearningAgent(SavableAlgorithm):
         exploration: str | Exploration = "auto",
         gamma: float = 0.99,
         num_simulations: int = 64,
+        time_budget: float | None = None,
         horizon: int = 20,
         policy_kwargs: dict[str, Any] | None = None,
         stats_window_size: int = 100,
@@ -126,7 +128,7 @@ class ModelLearningAgent(SavableAlgorithm):
             raise TypeError(f"policy must be a planner policy such as 'MctsPolicy', got {self.policy_class.__name__}.")
         self.model_name = check_model(model)
         self.exploration_name = check_exploration(exploration)
-        self.gamma, self.num_simulations, self.horizon = gamma, num_simulations, horizon
+        self.gamma, self.num_simulations, self.time_budget, self.horizon = gamma, num_simulations, time_budget, horizon
         self.fit_report: FitReport | None = None
         self._custom_reward = reward
         self._planning_seed = seed if seed is not None else int(np.random.SeedSequence().generate_state(1)[0] >> 1)
@@ -147,7 +149,7 @@ class ModelLearningAgent(SavableAlgorithm):
         return self.policy.transition_model
 
     def _settings(self) -> PlannerSettings:
-        own: dict[str, Any] = {"num_simulations": self.num_simulations, "gamma": self.gamma, "horizon": self.horizon}
+        own = {name: getattr(self, name) for name in ("num_simulations", "time_budget", "gamma", "horizon")}
         known = sorted(set(PlannerSettings.__dataclass_fields__) - {*own, "seed"})
         unknown = sorted(set(self.policy_kwargs) - set(known))
         if unknown:
@@ -209,6 +211,22 @@ class ModelLearningAgent(SavableAlgorithm):
         """
         self.policy.set_goal(self.goals.choose(reward))
 
+    def explain(self, obs: Any, *, n_futures: int = 3, n_steps: int = 10) -> Explanation:
+        """Why ``predict`` takes the action it takes: every action's value, standard error, visits and likeliest futures.
+
+        The same call gives the same answer, and ``predict`` is not changed by it. It takes about ten times as long as a first
+        decision. See Explanation for an example.
+
+        Args:
+            obs: one observation.
+            n_futures: futures for each action, at most.
+            n_steps: steps of each future, at most.
+
+        Raises:
+            ValueError: nothing is learned yet, no goal is known, or a batch is given.
+        """
+        return explain(self.policy, obs, n_futures, n_steps)
+
     def _refresh(self) -> None:
         """Drops every planning cache and works the goal out anew."""
         self.policy.goal = None
@@ -257,14 +275,14 @@ class ModelLearningAgent(SavableAlgorithm):
                 iteration += 1
                 self._update_current_progress_remaining(self.num_timesteps, max(total, 1))
                 if log_interval is not None and iteration % log_interval == 0:
-                    self._log_rollout()
+                    log_rollout(self, self.start_time, self._num_timesteps_at_start)
                     self.logger.dump(self.num_timesteps)
         finally:  # an interrupted run keeps what it met: learn(0) fits to it
             self._recorder.flush()
         if len(self.transitions):
             self._fit(self._recorder, progress_bar)
             if log_interval is not None:
-                self._log_rollout()
+                log_rollout(self, self.start_time, self._num_timesteps_at_start)
                 self.logger.dump(self.num_timesteps)
         callbacks.on_training_end()
         return self
@@ -315,30 +333,6 @@ class ModelLearningAgent(SavableAlgorithm):
             self.logger.record("plan/start_value", float(plan.values.max()))
             self.logger.record("plan/first_seconds", time.perf_counter() - began)
             self.logger.record("plan/goal", self.goals.source)
-
-    def _log_rollout(self) -> None:
-        seconds = max((time.time_ns() - self.start_time) / 1e9, 1e-9)
-        if self.ep_info_buffer:
-            self.logger.record("rollout/ep_rew_mean", safe_mean([info["r"] for info in self.ep_info_buffer]))
-            self.logger.record("rollout/ep_len_mean", safe_mean([info["l"] for info in self.ep_info_buffer]))
-        if self.ep_success_buffer:
-            self.logger.record("rollout/success_rate", safe_mean(self.ep_success_buffer))
-        self.logger.record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / seconds))
-        self.logger.record("time/time_elapsed", int(seconds), exclude="tensorboard")
-        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-
-    def save_transitions(self, path: str) -> None:
-        """Writes what was experienced as an ``.npz`` of plain arrays (see TransitionDataset.save)."""
-        self.transitions.save(path)
-
-    def load_transitions(self, path: str) -> None:
-        """Takes transitions from a file into this agent's experience; the next ``learn`` fits to them too.
-
-        Raises:
-            ValueError: they come from another kind of environment; nothing is changed then.
-        """
-        loaded = TransitionDataset.load(path)
-        self.transitions.take(loaded)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Changes the environment (same spaces); without a custom reward the goal becomes the new environment's."""

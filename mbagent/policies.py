@@ -43,7 +43,8 @@ class PlannerPolicy(BasePolicy):
         settings: see PlannerSettings.
 
     Raises:
-        ValueError: forecasts="direct" with another planner, or with a model that has none.
+        ValueError: forecasts="direct" with another planner, or with a model that has none; a time budget or the reuse of trees
+            with a planner that has no use for it.
     """
 
     planner_class: ClassVar[type[Planner]] = MctsPlanner
@@ -68,6 +69,10 @@ class PlannerPolicy(BasePolicy):
             if self.planner_class is not FlatMonteCarlo:
                 raise ValueError("forecasts='direct' is for the FlatMonteCarloPolicy; other planners go step by step.")
             direct_model(model)
+        if settings.time_budget is not None and self.planner_class is MachinePlanner:
+            raise ValueError("time_budget is for policies that simulate; the ValueIterationPolicy goes by lookahead_states.")
+        if settings.reuse_tree and not issubclass(self.planner_class, MctsPlanner):
+            raise ValueError("reuse_tree is for the MctsPolicy; other planners keep no tree.")
         self.planner: Planner = self.planner_class(settings)
         self.start_states: States = np.zeros((0, len(self.factored)), dtype=np.int64)
         self.goal: Goal | None = None
@@ -108,7 +113,7 @@ class PlannerPolicy(BasePolicy):
         Args:
             observation: one observation of the space, or a batch of them.
             state: passed through (the policy has no memory).
-            episode_start: ignored, as there is no memory.
+            episode_start: bool [B]; ignored, as there is no memory, but for dropping the tree that ``reuse_tree`` keeps.
             deterministic: makes no difference: both mean the best action found.
 
         Returns:
@@ -119,6 +124,8 @@ class PlannerPolicy(BasePolicy):
         """
         batch, single = as_batch(self.observation_space, observation)
         states = self.factored.encode(batch)
+        if self.settings.reuse_tree and isinstance(self.planner, MctsPlanner) and np.any(episode_start):
+            self.planner.forget()
         if self.fitted:
             indices = self.plan(states).actions
         else:

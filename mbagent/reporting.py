@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.utils import safe_mean
 
 from mbagent.models.base import FitReport
 
@@ -60,3 +63,22 @@ def log_fit(logger: Logger, report: FitReport, n_updates: int, n_transitions: in
     logger.record("model/start_states", n_start_states)
     for name, value in report.log.items():
         logger.record(f"model/{name}", value)
+
+
+def log_rollout(agent: BaseAlgorithm, began: float, steps_before: int) -> None:
+    """Writes the ``rollout/`` and ``time/`` figures to the agent's log.
+
+    Args:
+        agent: whose buffers of episodes are read.
+        began: when ``learn`` began, nanoseconds since the epoch.
+        steps_before: environment steps before that.
+    """
+    seconds, logger = max((time.time_ns() - began) / 1e9, 1e-9), agent.logger
+    if agent.ep_info_buffer:
+        logger.record("rollout/ep_rew_mean", safe_mean([info["r"] for info in agent.ep_info_buffer]))
+        logger.record("rollout/ep_len_mean", safe_mean([info["l"] for info in agent.ep_info_buffer]))
+    if agent.ep_success_buffer:
+        logger.record("rollout/success_rate", safe_mean(agent.ep_success_buffer))
+    logger.record("time/fps", int((agent.num_timesteps - steps_before) / seconds))
+    logger.record("time/time_elapsed", int(seconds), exclude="tensorboard")
+    logger.record("time/total_timesteps", agent.num_timesteps, exclude="tensorboard")

@@ -16,7 +16,7 @@ from stable_baselines3.common.utils import check_for_correct_spaces, get_system_
 from mbagent import persistence
 from mbagent.goals import Source
 from mbagent.rewards import RewardFn
-from mbagent.transitions import TransitionBatch
+from mbagent.transitions import TransitionBatch, TransitionDataset
 
 if TYPE_CHECKING:
     from mbagent.agent import ModelLearningAgent
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 SETTINGS = (
     "gamma",
     "num_simulations",
+    "time_budget",
     "horizon",
     "policy_kwargs",
     "stats_window_size",
@@ -121,6 +122,19 @@ class SavableAlgorithm(BaseAlgorithm):
             params = {"policy": persistence.read(os.fspath(params))[1]["policy"]}
         super().set_parameters(dict(params), exact_match, device)
         cast("ModelLearningAgent", self)._refresh()
+
+    def save_transitions(self, path: str) -> None:
+        """Writes what was experienced as an ``.npz`` of plain arrays (see TransitionDataset.save)."""
+        cast("ModelLearningAgent", self).transitions.save(path)
+
+    def load_transitions(self, path: str) -> None:
+        """Takes transitions from a file into this agent's experience; the next ``learn`` fits to them too.
+
+        Raises:
+            ValueError: they come from another kind of environment; nothing is changed then.
+        """
+        loaded = TransitionDataset.load(path)
+        cast("ModelLearningAgent", self).transitions.take(loaded)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "policy", "transitions", "goals"]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from mbagent.models.base import Floats, States, TransitionModel
 from mbagent.models.state_graph import Indices, StateGraph
+from mbagent.planning.foresight import Foresight, best_behaviour
 from mbagent.planning.goal import Goal
 from mbagent.planning.lookahead import grow_lookahead
 from mbagent.planning.planner import Plan, PlannerSettings, best_actions
@@ -13,6 +16,26 @@ from mbagent.planning.value_iteration import Machine, Values, break_ties, solve
 
 ROOTS_AT_ONCE = 16
 """Roots that are imagined around together; bounds the memory."""
+
+
+class Imagined(NamedTuple):
+    """What was imagined around R roots, and what follows from it.
+
+    Attributes:
+        graph: root r lies in group r.
+        nodes: int64 [R], the roots.
+        solution: values of the graph.
+        visits: [R, A], simulations through the roots' actions.
+        scores: [R, A], what the choice goes by.
+        tried: [N, A], simulations through all nodes' actions where behaviour goes by them; None where by values.
+    """
+
+    graph: StateGraph
+    nodes: Indices
+    solution: Values
+    visits: Floats
+    scores: Floats
+    tried: Floats | None = None
 
 
 class MachinePlanner:
@@ -54,13 +77,31 @@ class MachinePlanner:
         unknown = np.flatnonzero(nodes < 0)
         for begin in range(0, len(unknown), ROOTS_AT_ONCE):
             some = unknown[begin : begin + ROOTS_AT_ONCE]
-            values[some], visits[some], scores[some] = self._search(*self._lookahead(roots[some]))
+            found = self._imagine(roots[some])
+            values[some], visits[some], scores[some] = found.solution.q[found.nodes], found.visits, found.scores
         return Plan(best_actions(scores), values, visits)
 
-    def _search(self, graph: StateGraph, solution: Values, nodes: Indices) -> tuple[Floats, Floats, Floats]:
-        """(values, visits, scores) [R, A] of the root nodes [R]; here the values as they are, without a search."""
-        values = solution.q[nodes]
-        return values, np.zeros_like(values), break_ties(graph, solution.q, nodes, self.settings.gamma)
+    def foresee(self, root: States) -> Foresight:
+        """What the plan from one root [1, F] rests on; see Foresight."""
+        machine = self._solved_machine()
+        nodes = machine.find(root)
+        if nodes[0] < 0 or machine.graph is None or machine.values is None:
+            return self._foresight(self._imagine(root), 0)
+        graph, solution = machine.graph, machine.values
+        scores = break_ties(graph, solution.q, nodes, self.settings.gamma)
+        nothing = np.zeros((1, graph.model.n_actions))
+        return self._foresight(Imagined(graph, nodes, solution, nothing, scores), int(graph.expanded.sum()))
+
+    def _foresight(self, found: Imagined, machine_states: int) -> Foresight:
+        plan = Plan(best_actions(found.scores), found.solution.q[found.nodes], found.visits)
+        behaviour = best_behaviour(found.graph, found.solution.q, self.settings.gamma, found.tried)
+        return Foresight(plan, found.graph, int(found.nodes[0]), found.solution.rewards, behaviour, machine_states)
+
+    def _imagine(self, roots: States) -> Imagined:
+        """Imagines around each root [R, F]; here a lookahead machine, solved, without a search."""
+        graph, solution, nodes = self._lookahead(roots)
+        scores = break_ties(graph, solution.q, nodes, self.settings.gamma)
+        return Imagined(graph, nodes, solution, np.zeros_like(scores), scores)
 
     def _empty_graph(self) -> StateGraph:
         """A graph for the next roots; what the last one held is gone."""

@@ -17,8 +17,12 @@ class PlannerSettings:
     """How planners spend their effort.
 
     Attributes:
-        num_simulations: simulations for each decision.
-        gamma: discount of a step; below one.
+        num_simulations: simulations for each decision; ignored with a time budget.
+        time_budget: seconds for each decision instead (of a batch: times the number of observations), or None. Simulations go
+            on in waves, one at least, until the next would not be done in time, or MAX_SEARCHED states are imagined. The first
+            decision under a new goal takes longer where it generates and solves the reachable machine; where that is solved, no
+            time is needed. Outcomes then depend on the speed of the machine.
+        gamma: discount of a step, above 0 and below 1: the values of an endless world need an end.
         horizon: steps a simulation looks ahead, at most.
         max_states: reachable states up to which the whole machine is solved once, for all decisions.
         lookahead_states: states imagined around each root where the whole machine is larger than that.
@@ -32,6 +36,7 @@ class PlannerSettings:
         c_uct: weight of the search's exploration, in units of the range of values seen.
         wave: simulations between two calls of the model.
         prior_visits: how many visits a value from the machine counts for in the search.
+        reuse_tree: whether a decision begins with what the last one imagined (MctsPolicy, one observation at a time).
         seed: which random numbers.
 
     Raises:
@@ -39,6 +44,7 @@ class PlannerSettings:
     """
 
     num_simulations: int = 64
+    time_budget: float | None = None
     gamma: float = 0.99
     horizon: int = 20
     max_states: int = 3000
@@ -52,6 +58,7 @@ class PlannerSettings:
     c_uct: float = 0.5
     wave: int = 16
     prior_visits: float = 8.0
+    reuse_tree: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -75,7 +82,21 @@ class PlannerSettings:
                 raise ValueError(f"{name} must be a finite number that is not negative, got {value!r}.")
             object.__setattr__(self, name, float(value))
         if not 0.0 < self.gamma < 1.0:
-            raise ValueError(f"gamma must lie between 0 and 1, both excluded, got {self.gamma!r}.")
+            raise ValueError(
+                f"gamma must lie between 0 and 1, both excluded, got {self.gamma!r}: the values of worlds without an end need a "
+                "discount below 1; 0.99 is the default."
+            )
+        self._check_choices()
+
+    def _check_choices(self) -> None:
+        budget = self.time_budget
+        if budget is not None:
+            number = not isinstance(budget, bool) and isinstance(budget, int | float | np.number)
+            if not number or not 0.0 < budget < math.inf:
+                raise ValueError(f"time_budget must be a finite number of seconds above 0, or None, got {budget!r}.")
+            object.__setattr__(self, "time_budget", float(budget))
+        if not isinstance(self.reuse_tree, bool):
+            raise ValueError(f"reuse_tree must be True or False, got {self.reuse_tree!r}.")
         choices = {
             "leaf_values": ("machine", "rollouts"),
             "backup": ("max", "mean"),
@@ -105,7 +126,10 @@ class Plan:
 
 
 class Planner(Protocol):
-    """Chooses actions by imagining with a model; the outcome is a pure function of (settings, model, goal, root)."""
+    """Chooses actions by imagining with a model; the outcome is a pure function of (settings, model, goal, root).
+
+    One that can also show what a plan rests on has the method of ``foresight.ForeseeingPlanner``.
+    """
 
     def __init__(self, settings: PlannerSettings) -> None:
         """Takes the settings; a model and a goal must follow."""
