@@ -59,8 +59,8 @@ def search_tree(tree: Any, arrays: dict[str, Array], roots: Array, simulations: 
         # Nodes cannot end here; states that do lead to themselves and earn nothing (see ``without_ends``).
         rewards, values = arrays["rewards"][at, following], arrays["leaf_values"][following]
         tree.batch_backpropagate(simulation, gamma, rewards.tolist(), values.tolist(), flat, stats, results, players)
-    visits = np.array(nodes.get_distributions(), dtype=np.int64)
-    return visits.argmax(axis=1)
+    best: Array = np.asarray(nodes.get_distributions()).argmax(axis=1)
+    return best
 
 
 def without_ends(arrays: dict[str, Array]) -> dict[str, Array]:
