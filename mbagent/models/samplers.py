@@ -1,8 +1,8 @@
 """The samplers made of predictor and conditioner (paper 3.1 and 3.2), compiled; every row draws from its own key.
 
 Three ways to an outcome: each factor by itself (no conditioner), ancestral (conditioner masked to y_<i; exact), and
-the paper's sweeps (conditioner masked to all but y_i; in ``sweeps.py``). Shapes: B batch, F state factors, O output factors, K largest
-cardinality. Array rows are addressed by index, not sliced: a slice costs more than what is done with it here.
+the paper's sweeps (conditioner masked to all but y_i; in ``sweeps.py``). Shapes: B batch, F state factors, O output
+factors, K largest cardinality. Array rows are addressed by index, not sliced: a slice costs more than what is done with it here.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from mbagent_envs._compiled import borrowed, compiled
 from mbagent_envs.random_keys import uniform_at
 
 Keys = NDArray[np.uint64]
+
 
 class Work(NamedTuple):
     """Work space for one row.
@@ -58,6 +59,7 @@ class Work(NamedTuple):
 
 @compiled
 def work_space(layout: Layout, group: GroupWeights) -> Work:
+    """Room for one row of a model of this shape."""
     n_outputs, n_columns, size, n_values = len(layout.outputs), group.others.shape[1], group.bias.shape[1], group.offset.shape[1]
     return Work(
         np.empty(n_outputs + layout.n_steps, dtype=np.int64),
@@ -110,6 +112,7 @@ def _likeliest(values: Floats, n: int) -> int:
 
 @compiled
 def copy_row(table: Floats32, row: int, out: Floats32) -> None:
+    """Copies ``table[row]`` to ``out``, without the slice."""
     for h in range(len(out)):
         out[h] = table[row, h]
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -145,8 +146,8 @@ def compare_with_naive(model: NeuralTransitionModel, sampler: str, batches: Sequ
     for batch in batches:
         states, actions = random_inputs(d, batch, rng)
         keys = derive(seed, np.arange(batch))
-        naive = microseconds(lambda s=states, a=actions: naive_sample(model, s, a, seed), batch)
-        fast = microseconds(lambda s=states, a=actions, k=keys: model.sample(s, a, k), batch)
+        naive = microseconds(partial(naive_sample, model, states, actions, seed), batch)
+        fast = microseconds(partial(model.sample, states, actions, keys), batch)
         bar = BARS_NAIVE.get(batch, np.nan) if d == 32 else np.nan
         rows.append(SpeedUp(sampler, d, batch, naive, fast, naive / fast, bar))
     return rows
