@@ -19,7 +19,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 import tyro
@@ -28,10 +28,11 @@ from rich.table import Table
 
 from mbagent.analysis.folders import replaced, set_aside
 from mbagent.analysis.planning_benchmark.networks import build_task, run_networks_in_mctx
+from mbagent.analysis.planning_benchmark.noise import Sampler, trained
 from mbagent.analysis.planning_benchmark.page import TITLES, shown, write_page
 from mbagent.analysis.planning_benchmark.peers import PeerError
 from mbagent.analysis.planning_benchmark.regret import Settings, compare
-from mbagent.analysis.planning_benchmark.sampling import compare_short_cut, compare_with_naive, trained
+from mbagent.analysis.planning_benchmark.sampling import compare_short_cut, compare_with_naive
 
 Rows = list[dict[str, Any]]
 Say = Callable[[str], None]
@@ -56,8 +57,6 @@ class Args:
     """Simulations."""
     first_seed: int = 0
     """Of everything random."""
-    training_steps: tuple[int, int] = (3000, 400)
-    """Gradient steps of the networks that sweep, for 32 and for 128 bits."""
     draws: int = 4000
     """Draws from each input on which full sweeps and the short cut are compared."""
     output: Path = Path("results/planning")
@@ -74,9 +73,9 @@ def measure_regret(args: Args, say: Say) -> dict[str, Rows]:
 def measure_naive(args: Args, say: Say) -> dict[str, Rows]:
     """The compiled samplers beside the naive procedure."""
     rows: Rows = []
-    for sampler in ("networks", "sweeps"):
+    for sampler in get_args(Sampler):
         say(f"naive: {sampler}")
-        model = trained(sampler, 32, args.training_steps[0], args.first_seed)
+        model = trained(sampler, 32, args.first_seed)
         rows += [asdict(row) for row in compare_with_naive(model, sampler, (1, 64, 4096), args.first_seed)]
     return {"naive": rows}
 
@@ -84,9 +83,9 @@ def measure_naive(args: Args, say: Say) -> dict[str, Rows]:
 def measure_short_cut(args: Args, say: Say) -> dict[str, Rows]:
     """Sweeps over what is uncertain beside sweeps over everything."""
     rows: Rows = []
-    for d, steps in zip((32, 128), args.training_steps, strict=True):
+    for d in (32, 128):
         say(f"short cut: {d} bits")
-        model = trained("sweeps", d, steps, args.first_seed)
+        model = trained("sweeps", d, args.first_seed)
         rows += [asdict(compare_short_cut(model, sweeps, args.first_seed, 8, args.draws)) for sweeps in (1, 5)]
     return {"short cut": rows}
 

@@ -6,13 +6,14 @@ from dataclasses import replace
 from typing import Literal, TypeAlias
 
 import numpy as np
+import torch
 from gymnasium import spaces
 
 from mbagent.analysis.planning_benchmark.worlds import Ints
 from mbagent.models.config import NeuralConfig
 from mbagent.models.factory import build_model
 from mbagent.models.neural import NeuralTransitionModel
-from mbagent.models.training import TrainingConfig
+from mbagent.models.training import Trainer, TrainingConfig, examples
 from mbagent.spaces import FactoredSpace
 from mbagent.transitions import TransitionBatch, TransitionDataset
 
@@ -72,7 +73,7 @@ def build_sampler(sampler: Sampler, d: int, steps: int) -> NeuralTransitionModel
         sampler: "networks", as ``model="networks"`` builds it (causal conditioner); or "sweeps": predictor and conditioner
             of the paper's sizes, 2d + 1 and 2d a group, a group for every variable, and the paper's sampling.
         d: number of bits.
-        steps: of gradient descent, in the predictor and again in the conditioner; "sweeps" only.
+        steps: of gradient descent; "sweeps" only.
     """
     n_actions = len(PAIRS_REDRAWN)
     if sampler == "networks":
@@ -80,10 +81,36 @@ def build_sampler(sampler: Sampler, d: int, steps: int) -> NeuralTransitionModel
         assert isinstance(built, NeuralTransitionModel)
         return built
     training = TrainingConfig(
-        learning_rate=0.01, weight_decay=0.0, batch_size=128, min_steps=steps, max_steps=steps, checks=4, negligible=-1.0
+        learning_rate=0.01, weight_decay=0.0, batch_size=4096 // d, min_steps=steps, max_steps=steps, checks=2, negligible=-1.0
     )
     # Sizes, masks and procedure are the paper's; the rest is what makes networks trustworthy in few steps.
     config = replace(
         NeuralConfig.paper(d), activation="relu", residual=True, correction=True, certain=1.1, sweeps=1, training=training
     )
     return NeuralTransitionModel((2,) * d, n_actions, config)
+
+
+def trained(sampler: Sampler, d: int, seed: int, steps: tuple[int, int] = (3000, 300)) -> NeuralTransitionModel:
+    """A model fitted to random transitions.
+
+    Args:
+        sampler: see ``build_sampler``; "networks" is fitted as always.
+        d: number of bits.
+        seed: of data and fit.
+        steps: of gradient descent in the predictor and in the conditioner of "sweeps": a step of the conditioner, which has
+            d groups as large as the predictor, costs d times as much.
+    """
+    model, data = build_sampler(sampler, d, steps[1]), random_data(d, 6000, seed)
+    if sampler == "networks":
+        model.fit(data, seed=seed)
+        return model
+    training = replace(model.config.training, min_steps=steps[0], max_steps=steps[0])
+    alone = NeuralTransitionModel(
+        model.cardinalities, model.n_actions, replace(model.config, conditioner=None, training=training), seed=seed
+    )
+    alone.fit(data, seed=seed)
+    train, held_out = (examples(rows) for rows in data.split(training.validation, seed))
+    trainer = Trainer(model.codec, alone.predictor, model.conditioner, model.config.training)
+    trainer.fit_conditioner(train, held_out, torch.Generator().manual_seed(seed), None)
+    model.load_state_dict({**model.state_dict(), **alone.state_dict()})
+    return model

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from mbagent.analysis.planning_benchmark.noise import Sampler, build_sampler, random_data, random_inputs
+from mbagent.analysis.planning_benchmark.noise import random_inputs
 from mbagent.analysis.planning_benchmark.worlds import Floats, Ints
 from mbagent.models.neural import NeuralTransitionModel
 from mbagent_envs.random_keys import derive
@@ -205,10 +205,3 @@ def _apart(model: NeuralTransitionModel, sweeps: int, state: Ints, action: np.in
             draws.append(np.column_stack(model.sample(*given, keys)).astype(np.int64))
     pairs = pair_variations(*draws)
     return total_variation(*draws), float(pairs.mean()), float(pairs.max()), float((draws[0] != draws[1]).any(axis=1).mean())
-
-
-def trained(sampler: Sampler, d: int, steps: int, seed: int) -> NeuralTransitionModel:
-    """A model fitted to random transitions of the world in ``noise.py``."""
-    model = build_sampler(sampler, d, steps)
-    model.fit(random_data(d, 6000, seed), seed=seed)
-    return model
