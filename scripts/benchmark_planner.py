@@ -1,0 +1,161 @@
+"""Measures planning and sampling beside other packages: regret and speed on the same worlds.
+
+python scripts/benchmark_planner.py                                        # without other packages
+python scripts/benchmark_planner.py --peers-python peers/bin/python        # beside mctx, LightZero and gymcts
+python scripts/benchmark_planner.py --parts naive "short cut"
+
+The peers want an environment of their own; pyproject.toml, extra "peers", says how to make it.
+"""
+
+from __future__ import annotations
+
+import os
+
+# Before NumPy and torch are imported: everything is timed on one thread.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import csv
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import torch
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from mbagent.analysis.folders import replaced, set_aside
+from mbagent.analysis.planning_benchmark.networks import build_task, run_networks_in_mctx
+from mbagent.analysis.planning_benchmark.noise import Sampler, trained
+from mbagent.analysis.planning_benchmark.page import TITLES, shown, write_page
+from mbagent.analysis.planning_benchmark.peers import PeerError
+from mbagent.analysis.planning_benchmark.regret import Settings, compare
+from mbagent.analysis.planning_benchmark.sampling import compare_short_cut, compare_with_naive
+
+Rows = list[dict[str, Any]]
+Say = Callable[[str], None]
+PARTS = ("regret", "naive", "short cut", "networks")
+
+
+@dataclass(frozen=True)
+class Args:
+    """Measure planning and sampling."""
+
+    parts: tuple[str, ...] = PARTS
+    """What to measure: regret (with the speed of searches), naive, short cut, networks."""
+    peers_python: Path | None = None
+    """Python of the environment that has the peers; without it they are left out."""
+    worlds: int = Settings.worlds
+    """Random worlds of each kind."""
+    roots: int = Settings.roots
+    """Roots in each world."""
+    seeds: int = Settings.seeds
+    """Searches from each root with each budget."""
+    budgets: tuple[int, ...] = Settings.budgets
+    """Simulations."""
+    first_seed: int = 0
+    """Of everything random."""
+    draws: int = 4000
+    """Draws from each input on which full sweeps and the short cut are compared."""
+    output: Path = Path("results/planning")
+    """Folder for the tables and report.html; results of an earlier run there are moved to a folder of their own inside it."""
+
+
+def measure_regret(args: Args, say: Say) -> dict[str, Rows]:
+    """Regret and speed of searches on tables."""
+    settings = Settings(args.worlds, args.roots, args.seeds, args.first_seed, args.budgets, args.peers_python)
+    regrets, speeds = compare(settings, say=say)
+    return {"regret": [asdict(row) for row in regrets], "speed": [asdict(row) for row in speeds]}
+
+
+def measure_naive(args: Args, say: Say) -> dict[str, Rows]:
+    """The compiled samplers beside the naive procedure."""
+    rows: Rows = []
+    for sampler in get_args(Sampler):
+        say(f"naive: {sampler}")
+        model = trained(sampler, 32, args.first_seed)
+        rows += [asdict(row) for row in compare_with_naive(model, sampler, (1, 64, 4096), args.first_seed)]
+    return {"naive": rows}
+
+
+def measure_short_cut(args: Args, say: Say) -> dict[str, Rows]:
+    """Sweeps over what is uncertain beside sweeps over everything."""
+    rows: Rows = []
+    for d in (32, 128):
+        say(f"short cut: {d} bits")
+        model = trained("sweeps", d, args.first_seed)
+        rows += [asdict(compare_short_cut(model, sweeps, args.first_seed, 8, args.draws)) for sweeps in (1, 5)]
+    return {"short cut": rows}
+
+
+def measure_networks(args: Args, say: Say) -> dict[str, Rows]:
+    """Searches through learned networks."""
+    if args.peers_python is None:
+        say("Networks in mctx are left out: --peers-python is not given.")
+        return {}
+    say("networks: mctx, Gumbel MuZero")
+    try:
+        speeds, _ = run_networks_in_mctx(args.peers_python, build_task(args.first_seed))
+    except PeerError as error:
+        say(f"Left out: {error}")
+        return {}
+    return {"networks": [{"search": "mctx, Gumbel MuZero", **asdict(speed)} for speed in speeds]}
+
+
+_MEASURES: dict[str, Callable[[Args, Say], dict[str, Rows]]] = {
+    "regret": measure_regret,
+    "naive": measure_naive,
+    "short cut": measure_short_cut,
+    "networks": measure_networks,
+}
+
+
+def save(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Writes a csv with a line for each row."""
+    with replaced(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command line and returns its exit code."""
+    args = tyro.cli(Args, args=argv, description=__doc__.splitlines()[0])
+    console = Console()
+
+    def say(text: str) -> None:
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    unknown = [part for part in args.parts if part not in PARTS]
+    if unknown or min(args.worlds, args.roots, args.seeds, *args.budgets) < 1:
+        wrong = (
+            f"There is no part {unknown[0]!r}; choose from {', '.join(PARTS)}." if unknown else "All numbers must be at least 1."
+        )
+        console.print(wrong, style="red", highlight=False, markup=False, soft_wrap=True)
+        return 1
+    torch.set_num_threads(1)
+    args.output.mkdir(parents=True, exist_ok=True)
+    if moved := set_aside(args.output):
+        say(f"Moved earlier results to {moved}.")
+    tables: dict[str, Rows] = {}
+    for part in args.parts:
+        for name, rows in _MEASURES[part](args, say).items():
+            if rows:
+                tables[name] = rows
+                save(args.output / f"{name.replace(' ', '_')}.csv", rows)
+    pictures = write_page(args.output / "report.html", tables, "scripts/benchmark_planner.py")
+    for name, png in pictures.items():
+        (args.output / f"{name}.png").write_bytes(png)
+    for name, rows in tables.items():
+        table = Table(*rows[0], title=TITLES[name])
+        for row in rows:
+            table.add_row(*(shown(value) for value in row.values()))
+        Console(width=max(console.width, 140)).print(table)
+    say(f"Wrote report.html and the tables to {args.output}.")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
