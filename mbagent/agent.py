@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 import torch
@@ -129,8 +129,7 @@ class ModelLearningAgent(SavableAlgorithm):
         self.model_name = check_model(model)
         self.exploration_name = check_exploration(exploration)
         self.gamma, self.num_simulations, self.time_budget, self.horizon = gamma, num_simulations, time_budget, horizon
-        self.fit_report: FitReport | None = None
-        self._custom_reward = reward
+        self._custom_reward, self.fit_report = reward, cast("FitReport | None", None)
         self._planning_seed = seed if seed is not None else int(np.random.SeedSequence().generate_state(1)[0] >> 1)
         self._recorder: ExperienceRecorder | None = None
         self._rng = np.random.default_rng([self._planning_seed, EXPLORING])

@@ -27,16 +27,19 @@ from rich.console import Console
 from rich.table import Table
 
 from mbagent.analysis.folders import replaced, set_aside
+from mbagent.analysis.planning_benchmark.latency import SETTINGS
+from mbagent.analysis.planning_benchmark.latency import measure as measure_latency
 from mbagent.analysis.planning_benchmark.networks import build_task, run_networks_in_mctx
 from mbagent.analysis.planning_benchmark.noise import Sampler, trained
 from mbagent.analysis.planning_benchmark.page import TITLES, shown, write_page
 from mbagent.analysis.planning_benchmark.peers import PeerError
+from mbagent.analysis.planning_benchmark.quality import TOY_TEXT, play_game, play_table, scales, summary
 from mbagent.analysis.planning_benchmark.regret import Settings, compare
 from mbagent.analysis.planning_benchmark.sampling import compare_short_cut, compare_with_naive
 
 Rows = list[dict[str, Any]]
 Say = Callable[[str], None]
-PARTS = ("regret", "naive", "short cut", "networks")
+PARTS = ("quality", "decisions", "regret", "naive", "short cut", "networks")
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,9 @@ class Args:
     """Measure planning and sampling."""
 
     parts: tuple[str, ...] = PARTS
-    """What to measure: regret (with the speed of searches), naive, short cut, networks."""
+    """What to measure: quality of play, what decisions cost, regret (with the speed of searches), naive, short cut, networks."""
+    full: bool = False
+    """5 agents of each kind, learned ones too, instead of 1 with the true model."""
     peers_python: Path | None = None
     """Python of the environment that has the peers; without it they are left out."""
     worlds: int = Settings.worlds
@@ -61,6 +66,27 @@ class Args:
     """Draws from each input on which full sweeps and the short cut are compared."""
     output: Path = Path("results/planning")
     """Folder for the tables and report.html; results of an earlier run there are moved to a folder of their own inside it."""
+
+
+def measure_quality(args: Args, say: Say) -> dict[str, Rows]:
+    """Play with true models and, with ``--full``, with learned ones, against the best there is."""
+    seeds, rows = range(args.first_seed + 1000, args.first_seed + 1000 + (5 if args.full else 1)), []
+    for name in TOY_TEXT:
+        rows.append(summary([play_table(name, seed) for seed in seeds]))
+    for key, scale in scales(say).items():
+        for learned in (False, True) if args.full else (False,):
+            say(f"{key}, {'learned' if learned else 'true'} model")
+            rows.append(summary([play_game(key, seed, learned, scale) for seed in seeds]))
+    return {"quality": rows}
+
+
+def measure_decisions(args: Args, say: Say) -> dict[str, Rows]:
+    """Milliseconds of a decision beside PPO's."""
+    found, rows = scales(say), []
+    for setting in SETTINGS:
+        say(f"decisions: {setting.key}")
+        rows += measure_latency(setting, args.first_seed + 1000, found[setting.key], 50 if args.full else 10)
+    return {"decisions": rows}
 
 
 def measure_regret(args: Args, say: Say) -> dict[str, Rows]:
@@ -105,6 +131,8 @@ def measure_networks(args: Args, say: Say) -> dict[str, Rows]:
 
 
 _MEASURES: dict[str, Callable[[Args, Say], dict[str, Rows]]] = {
+    "quality": measure_quality,
+    "decisions": measure_decisions,
     "regret": measure_regret,
     "naive": measure_naive,
     "short cut": measure_short_cut,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,40 +13,23 @@ from numpy.typing import NDArray
 from mbagent.analysis.planning_benchmark.peers import Speed
 from mbagent.analysis.planning_benchmark.worlds import Bools, Floats, Ints, World
 from mbagent.models.base import BaseTransitionModel, FitReport, Randomness, Successors, as_keys
+from mbagent.planning.machine_search import known_machine, search_machine
 from mbagent.planning.mcts import MctsPlanner
-from mbagent.planning.planner import PlannerSettings
+from mbagent.planning.planner import PlannerSettings, best_actions
 from mbagent.transitions import TransitionDataset
 from mbagent_envs.random_keys import uniforms
 
 
 class TableSearch(Protocol):
-    """A search on a table."""
+    """A search in a world that was prepared."""
 
-    def __call__(
-        self,
-        table: Floats,
-        rewards: Floats,
-        ends: Bools,
-        leaf_values: Floats,
-        roots: Ints,
-        n_simulations: int,
-        seed: int,
-        *,
-        gamma: float,
-    ) -> Ints:
-        """Actions int64 [R].
-
-        Args:
-            table: P(next state | state, action), float64 [S, A, S].
-            rewards: on arrival, float64 [S].
-            ends: whether arrival terminates, bool [S].
-            leaf_values: what a state is worth that the search has not looked beyond, float64 [S].
-            roots: int64 [R]; the outcome of one must not depend on the others.
-            n_simulations: for each root.
-            seed: which random numbers.
-            gamma: discount of a step.
-        """
+    def __call__(self, roots: Ints, n_simulations: int, seed: int) -> tuple[Ints, int]:
+        """(actions int64 [R], next states drawn in all) from roots int64 [R]; one's outcome must not depend on the others."""
         ...
+
+
+Prepare: TypeAlias = Callable[[World], TableSearch]
+"""What is done once for a world: the rules and the goal are given, and what a state is worth that was not looked beyond."""
 
 
 class TableWorldModel(BaseTransitionModel):
@@ -87,55 +71,65 @@ class TableWorldModel(BaseTransitionModel):
         """Nothing to do."""
 
 
-def search_with_rollouts(
-    table: Floats,
-    rewards: Floats,
-    ends: Bools,
-    leaf_values: Floats,
-    roots: Ints,
-    n_simulations: int,
-    seed: int,
-    *,
-    gamma: float,
-) -> Ints:
-    """The agent's planner as textbook UCT; see TableSearch.
+def with_rollouts(world: World) -> TableSearch:
+    """The agent's planner as textbook UCT. It values leaves by random play and cannot be given leaf values."""
+    model, none = TableWorldModel(world.table, world.ends), np.zeros((0, 1), dtype=np.int64)
 
-    It values leaves by random play and cannot be given leaf values, so ``leaf_values`` is not used.
-    """
-    planner = MctsPlanner(
-        PlannerSettings(num_simulations=n_simulations, gamma=gamma, leaf_values="rollouts", backup="mean", seed=seed)
+    def search(roots: Ints, n_simulations: int, seed: int) -> tuple[Ints, int]:
+        settings = PlannerSettings(
+            num_simulations=n_simulations, gamma=world.gamma, leaf_values="rollouts", backup="mean", seed=seed
+        )
+        planner = MctsPlanner(settings)
+        planner.set_model(model, none)
+        planner.set_goal(lambda states, actions, next_states: world.rewards[next_states[:, 0]])
+        return planner.plan(roots[:, None]).actions, len(roots) * n_simulations
+
+    return search
+
+
+def on_machine(world: World) -> TableSearch:
+    """Tree search on the world as a known machine."""
+    n_states, n_actions, n_successors = world.successors.shape
+    following = np.ascontiguousarray(world.successors.reshape(-1))
+    machine = known_machine(
+        np.arange(n_states * n_actions + 1) * n_successors,
+        following,
+        world.probabilities.reshape(-1),
+        world.rewards[following],
+        world.ends[following],
+        world.leaf_values,
+        n_actions,
+        world.gamma,
     )
-    planner.set_model(TableWorldModel(table, ends), np.zeros((0, 1), dtype=np.int64))
-    planner.set_goal(lambda states, actions, next_states: rewards[next_states[:, 0]])
-    return planner.plan(roots[:, None]).actions
+
+    def search(roots: Ints, n_simulations: int, seed: int) -> tuple[Ints, int]:
+        found = search_machine(machine, roots, n_simulations, seed)
+        return best_actions(found.values), found.steps
+
+    return search
 
 
-OWN_SEARCHES: dict[str, TableSearch] = {"mbagent, random play at leaves": search_with_rollouts}
+OWN_SEARCHES: dict[str, Prepare] = {"mbagent": on_machine, "mbagent, random play at leaves": with_rollouts}
 """What is compared with the peers, by name."""
 
 
-def choose(search: TableSearch, world: World, roots: Ints, n_simulations: int, seed: int) -> Ints:
-    """The actions int64 [R] that a search takes in a world."""
-    given = (world.table, world.rewards, world.ends, world.leaf_values)
-    return search(*given, roots, n_simulations, seed, gamma=world.gamma)
-
-
-def time_search(
-    search: TableSearch, world: World, roots: Ints, speeds: Sequence[tuple[int, int]], repetitions: int = 5
-) -> list[Speed]:
+def time_search(search: TableSearch, roots: Ints, speeds: Sequence[tuple[int, int]], repetitions: int = 5) -> list[Speed]:
     """Times a search as the peers' scripts do: processor time on one thread, the median after a call that may compile.
 
-    A simulation is counted as one sample of the model.
+    A repetition is at least a hundredth of a second long: several calls, if need be.
     """
-    found, given = [], (world.table, world.rewards, world.ends, world.leaf_values)
+    found = []
     for n_roots, simulations in speeds:
         some, seconds = np.resize(roots, n_roots), []
-        search(*given, some, simulations, 0, gamma=world.gamma)
+        _, samples = search(some, simulations, 0)
+        began = time.process_time()
+        search(some, simulations, 0)
+        calls = max(1, math.ceil(0.01 / max(time.process_time() - began, 1e-6)))
         for repetition in range(repetitions):
             began = time.process_time()
-            search(*given, some, simulations, 1 + repetition, gamma=world.gamma)
-            seconds.append(time.process_time() - began)
+            for call in range(calls):
+                search(some, simulations, 1 + repetition * calls + call)
+            seconds.append((time.process_time() - began) / calls)
         median = max(float(np.median(seconds)), 1e-9)
-        rate = n_roots * simulations / median
-        found.append(Speed(n_roots, simulations, median, rate, rate))
+        found.append(Speed(n_roots, simulations, median, n_roots * simulations / median, samples / median))
     return found

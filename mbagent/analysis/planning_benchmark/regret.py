@@ -9,7 +9,7 @@ from typing import get_args
 
 import numpy as np
 
-from mbagent.analysis.planning_benchmark.ours import OWN_SEARCHES, TableSearch, choose, time_search
+from mbagent.analysis.planning_benchmark.ours import OWN_SEARCHES, Prepare, time_search
 from mbagent.analysis.planning_benchmark.peers import PEERS, SPEEDS, PeerError, PeerResult, Speed, run_peer
 from mbagent.analysis.planning_benchmark.worlds import N_STATES, Ints, Kind, World, choose_roots, random_world, side_by_side
 
@@ -105,7 +105,7 @@ def score(kind: str, search: str, simulations: int, arena: Arena, actions: Ints)
 
 
 def compare(
-    settings: Settings, own: Mapping[str, TableSearch] = OWN_SEARCHES, say: Callable[[str], None] = print
+    settings: Settings, own: Mapping[str, Prepare] = OWN_SEARCHES, say: Callable[[str], None] = print
 ) -> tuple[list[RegretRow], list[SpeedRow]]:
     """Runs all searches on all worlds.
 
@@ -123,12 +123,13 @@ def compare(
         arena = build_arena(kind, settings)
         # Times do not depend on what the rewards are: they are taken once.
         timed = SPEEDS if number == 0 else ()
-        for name, search in own.items():
+        for name, prepare in own.items():
             say(f"{kind} worlds: {name}")
+            search = prepare(arena.world)
             for n in settings.budgets:
-                actions = np.stack([choose(search, arena.world, arena.roots, n, seed) for seed in seeds])
+                actions = np.stack([search(arena.roots, n, seed)[0] for seed in seeds])
                 regrets.append(score(kind, name, n, arena, actions))
-            speeds += _rows(name, time_search(search, arena.world, arena.roots, timed, settings.repetitions))
+            speeds += _rows(name, time_search(search, arena.roots, timed, settings.repetitions))
         for result in _peers(settings, kind, arena, seeds, timed, say):
             regrets += [score(kind, result.name, n, arena, actions) for n, actions in result.choices.items()]
             speeds += _rows(result.name, result.speeds)

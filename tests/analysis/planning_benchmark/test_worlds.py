@@ -4,11 +4,11 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from mbagent.analysis.planning_benchmark.ours import OWN_SEARCHES, TableWorldModel, choose
+from mbagent.analysis.planning_benchmark.ours import OWN_SEARCHES, TableSearch, TableWorldModel
 from mbagent.analysis.planning_benchmark.page import write_page
 from mbagent.analysis.planning_benchmark.peers import PeerError, run_peer
 from mbagent.analysis.planning_benchmark.regret import Settings, build_arena, compare, score
-from mbagent.analysis.planning_benchmark.worlds import Bools, Floats, Ints, Kind, choose_roots, random_world, side_by_side
+from mbagent.analysis.planning_benchmark.worlds import Floats, Ints, Kind, World, choose_roots, random_world, side_by_side
 from tests.worlds import optimal_q
 
 
@@ -52,16 +52,18 @@ def test_the_planner_on_a_table_needs_no_luck_where_one_action_is_far_better() -
     assert np.abs(np.bincount(drawn[:, 0], minlength=25) / 4000 - world.table[3, 0]).max() < 0.04
     assert np.array_equal(ended, world.ends[drawn[:, 0]])
     roots = choose_roots(world, 4, 0)
-    taken = choose(OWN_SEARCHES["mbagent, random play at leaves"], world, roots, 512, 0)
-    assert world.regrets(roots, taken).mean() < 0.5 * world.random_regrets(roots).mean()
+    for prepare in OWN_SEARCHES.values():
+        taken, samples = prepare(world)(roots, 512, 0)
+        assert world.regrets(roots, taken).mean() < 0.5 * world.random_regrets(roots).mean()
+        assert samples >= 4 * 512
 
 
-def greedy_in_leaf_values(
-    table: Floats, rewards: Floats, ends: Bools, leaf_values: Floats, roots: Ints, n_simulations: int, seed: int, *, gamma: float
-) -> Ints:
-    worth: Floats = table[roots] @ (rewards + gamma * leaf_values)
-    best: Ints = worth.argmax(axis=1)
-    return best
+def greedy_in_leaf_values(world: World) -> TableSearch:
+    def search(roots: Ints, n_simulations: int, seed: int) -> tuple[Ints, int]:
+        worth: Floats = world.table[roots] @ (world.rewards + world.gamma * world.leaf_values)
+        return worth.argmax(axis=1), 0
+
+    return search
 
 
 def test_without_peers_one_line_says_so_and_the_page_shows_the_rest(tmp_path: Path) -> None:
