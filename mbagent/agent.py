@@ -191,7 +191,7 @@ class ModelLearningAgent(SavableAlgorithm):
         if start_states is not None:  # a model that needs no learning, such as the true simulator
             policy.start_states = distinct_rows(start_states(MAX_START_STATES))
             policy.fitted = True
-            policy.refresh()
+        self.policy.refresh()
         self.set_reward(self._custom_reward) if self._custom_reward is not None else self._refresh()
 
     def _build_exploration(self, n_actions: int) -> Exploration:

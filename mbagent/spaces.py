@@ -200,6 +200,8 @@ class ActionEnumeration:
         return self.factored.decode_wide(self._factors(indices))
 
     def _factors(self, indices: NDArray[Any]) -> Factors:
+        if len(self.factored) == 1:
+            return np.asarray(indices, dtype=np.int64)[:, None]
         return np.stack(np.unravel_index(np.asarray(indices), self.factored.cardinalities), axis=1).astype(np.int64)
 
 

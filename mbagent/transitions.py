@@ -2,33 +2,45 @@
 
 from __future__ import annotations
 
+import json
 import os
+import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 _COLUMNS = ("states", "actions", "next_states", "terminated", "rewards", "episodes")
+_KEPT = ("before", "actions", "after", "terminated", "rewards", "episodes")
+
+_MAPPED = 1_000_000
+"""Bytes of a selection of mapped rows from which on it is mapped, too."""
+
+Factors: TypeAlias = NDArray[np.integer[Any]]
+"""Values of factors, of whatever width holds them."""
 
 
 @dataclass(frozen=True)
 class TransitionBatch:
     """Rows of experience.
 
+    States are kept as narrow as they are given: a dataset keeps bits as single bytes, an eighth of what int64 takes.
+
     Attributes:
-        states: int64 [N, F].
+        before: states, int [N, F] of any width.
         actions: int64 [N], numbers of the enumerated actions.
-        next_states: int64 [N, F].
+        after: next states, as ``before``.
         terminated: bool [N]; truncation is not recorded, since it says nothing of the world.
         rewards: float64 [N], as met (kept for the learned reward; no transition model reads them).
         episodes: int64 [N], which episode a row is from.
     """
 
-    states: NDArray[np.int64]
+    before: Factors
     actions: NDArray[np.int64]
-    next_states: NDArray[np.int64]
+    after: Factors
     terminated: NDArray[np.bool_]
     rewards: NDArray[np.float64]
     episodes: NDArray[np.int64]
@@ -37,9 +49,28 @@ class TransitionBatch:
         """Number of rows N."""
         return len(self.actions)
 
-    def select(self, rows: NDArray[Any]) -> TransitionBatch:
-        """The rows with the given indices or mask."""
-        return TransitionBatch(*(getattr(self, name)[rows] for name in _COLUMNS))
+    @property
+    def states(self) -> NDArray[np.int64]:
+        """States, int64 [N, F]; made anew at every call where they are kept narrower."""
+        return self.before.astype(np.int64, copy=False)
+
+    @property
+    def next_states(self) -> NDArray[np.int64]:
+        """Next states, as ``states``."""
+        return self.after.astype(np.int64, copy=False)
+
+    def select(self, rows: NDArray[Any] | slice) -> TransitionBatch:
+        """The rows with the given indices or mask, as narrow as these; many rows of mapped files are in a mapped file, too."""
+        return TransitionBatch(*(_taken(getattr(self, name), rows) for name in _KEPT))
+
+    def narrowed(self, kind: np.dtype[Any]) -> TransitionBatch:
+        """The same rows with states of another integer type."""
+        return replace(self, before=self.before.astype(kind, copy=False), after=self.after.astype(kind, copy=False))
+
+    def parts(self, size: int) -> Iterator[TransitionBatch]:
+        """The rows, at most ``size`` at once, in their order."""
+        for begin in range(0, len(self), size):
+            yield self.select(slice(begin, begin + size))
 
 
 @dataclass
@@ -49,11 +80,28 @@ class TransitionDataset:
     Args:
         cardinalities: number of values of each state factor, length F.
         n_actions: number of enumerated actions A.
+        folder: where to keep the rows, in files that grow and are mapped into memory, so that there may be more than fit
+            into it; None to keep them in memory. Rows that are in the folder already are the first.
+
+    Raises:
+        ValueError: the folder holds transitions of another environment.
     """
 
     cardinalities: tuple[int, ...]
     n_actions: int
+    folder: str | os.PathLike[str] | None = None
     _chunks: list[TransitionBatch] = field(default_factory=list, repr=False)
+
+    def __post_init__(self) -> None:
+        """Begins a folder, or goes on with what is in it."""
+        self.cardinalities = tuple(int(c) for c in self.cardinalities)
+        if self.folder is not None:
+            self._chunks = [_begun(Path(self.folder), self.cardinalities, self.n_actions, self.kind)]
+
+    @property
+    def kind(self) -> np.dtype[Any]:
+        """The smallest unsigned integers that hold all values of factors."""
+        return np.min_scalar_type(max((*self.cardinalities, 2)) - 1)
 
     def __len__(self) -> int:
         """Number of transitions."""
@@ -68,19 +116,29 @@ class TransitionDataset:
         """Adds rows.
 
         Raises:
-            ValueError: states of another width, or actions out of range.
+            ValueError: states of another width, or values or actions out of range.
         """
-        if batch.states.shape != (len(batch), len(self.cardinalities)) or batch.next_states.shape != batch.states.shape:
+        if batch.before.shape != (len(batch), len(self.cardinalities)) or batch.after.shape != batch.before.shape:
             raise ValueError(
-                f"These transitions have states of shape {batch.states.shape} and next states of shape "
-                f"{batch.next_states.shape}, but this dataset holds {len(self.cardinalities)} factors; "
+                f"These transitions have states of shape {batch.before.shape} and next states of shape "
+                f"{batch.after.shape}, but this dataset holds {len(self.cardinalities)} factors; "
                 "they come from another environment."
             )
         if len(batch) and not (batch.actions.min() >= 0 and batch.actions.max() < self.n_actions):
             raise ValueError(
                 f"These transitions have actions outside 0 ... {self.n_actions - 1}; they come from another environment."
             )
-        self._chunks.append(batch)
+        for values in (batch.before, batch.after):
+            if values.size and not (values.min() >= 0 and values.max() <= np.iinfo(self.kind).max):
+                raise ValueError(
+                    f"These transitions have values outside 0 ... {max(self.cardinalities) - 1}; they come from elsewhere."
+                )
+        narrow = batch.narrowed(self.kind)
+        if self.folder is None:
+            self._chunks.append(narrow)
+        elif len(batch):
+            _write(Path(self.folder), narrow, len(self))
+            self._chunks = [_mapped(Path(self.folder), len(self.cardinalities), self.kind)]
 
     def take(self, other: TransitionDataset) -> None:
         """Appends all rows of another dataset, as further episodes.
@@ -101,10 +159,10 @@ class TransitionDataset:
         """All rows as one batch, in the order met."""
         if not self._chunks:
             n = len(self.cardinalities)
-            ints, none = np.zeros((0, n), dtype=np.int64), np.zeros(0, dtype=np.int64)
+            ints, none = np.zeros((0, n), dtype=self.kind), np.zeros(0, dtype=np.int64)
             return TransitionBatch(ints, none, ints, none.astype(np.bool_), none.astype(np.float64), none)
         if len(self._chunks) > 1:
-            merged = (np.concatenate([getattr(chunk, name) for chunk in self._chunks]) for name in _COLUMNS)
+            merged = (np.concatenate([getattr(chunk, name) for chunk in self._chunks]) for name in _KEPT)
             self._chunks = [TransitionBatch(*merged)]
         return self._chunks[0]
 
@@ -143,34 +201,99 @@ class TransitionDataset:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Writes the table as a compressed ``.npz`` (plain arrays: any language reads it, nothing is pickled)."""
         rows = self.rows()
-        largest = max((*self.cardinalities, 2)) - 1
-        small = np.min_scalar_type(largest)
         np.savez_compressed(
             Path(path),
             cardinalities=np.array(self.cardinalities),
             n_actions=np.array(self.n_actions),
             allow_pickle=False,
-            **{name: _narrow(getattr(rows, name), name, small) for name in _COLUMNS},
+            **{name: getattr(rows, kept) for name, kept in zip(_COLUMNS, _KEPT, strict=True)},
         )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> TransitionDataset:
-        """Reads what ``save`` wrote.
+        """Reads what ``save`` wrote; or, mapped into memory, a dataset's folder.
 
         Raises:
-            ValueError: the file is not such a table.
+            ValueError: the file, or what is in the folder, is not such a table.
         """
+        if Path(path).is_dir():
+            about = _about(Path(path))
+            return cls(tuple(about["cardinalities"]), about["n_actions"], path)
         with np.load(Path(path), allow_pickle=False) as archive:
             missing = [name for name in (*_COLUMNS, "cardinalities", "n_actions") if name not in archive]
             if missing:
                 raise ValueError(f"{path} is no table of transitions: it lacks {', '.join(missing)}.")
             data = cls(tuple(int(c) for c in archive["cardinalities"]), int(archive["n_actions"]))
-            wide = {name: archive[name] for name in _COLUMNS}
-        for name in ("states", "actions", "next_states", "episodes"):
-            wide[name] = wide[name].astype(np.int64)
-        data.append(TransitionBatch(**wide))
+            columns = {name: archive[name] for name in _COLUMNS}
+        for name in ("actions", "episodes"):
+            columns[name] = columns[name].astype(np.int64)
+        data.append(TransitionBatch(*(columns[name] for name in _COLUMNS)))
         return data
 
 
-def _narrow(values: NDArray[Any], name: str, small: np.dtype[Any]) -> NDArray[Any]:
-    return values.astype(small) if name in ("states", "next_states") else values
+def _taken(values: NDArray[Any], rows: NDArray[Any] | slice) -> NDArray[Any]:
+    """Some rows; where they are many of a mapped array, in a temporary file that is mapped."""
+    if not isinstance(values, np.memmap) or isinstance(rows, slice):
+        return values[rows]
+    numbers = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
+    shape = (len(numbers), *values.shape[1:])
+    if np.prod(shape) * values.itemsize < _MAPPED:
+        return np.asarray(values[numbers])
+    with tempfile.TemporaryFile() as file:
+        result: NDArray[Any] = np.memmap(file, dtype=values.dtype, mode="w+", shape=shape)
+    step = max(1, _MAPPED // max(1, values[:1].nbytes))
+    for begin in range(0, len(numbers), step):
+        result[begin : begin + step] = values[numbers[begin : begin + step]]
+    return result
+
+
+def _about(folder: Path) -> dict[str, Any]:
+    """What a dataset's folder says of its columns."""
+    try:
+        about = json.loads((folder / "dataset.json").read_text(encoding="utf-8"))
+        return {"cardinalities": [int(c) for c in about["cardinalities"]], "n_actions": int(about["n_actions"])}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{folder} is no folder of transitions: its dataset.json cannot be read ({error}).") from error
+
+
+def _begun(folder: Path, cardinalities: tuple[int, ...], n_actions: int, kind: np.dtype[Any]) -> TransitionBatch:
+    """A folder's rows; makes the folder where there is none."""
+    about = {"cardinalities": list(cardinalities), "n_actions": n_actions}
+    if not (folder / "dataset.json").exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in _COLUMNS:
+            (folder / f"{name}.bin").touch()
+        (folder / "dataset.json").write_text(json.dumps(about), encoding="utf-8")
+    if _about(folder) != about:
+        raise ValueError(f"{folder} holds transitions of another environment; choose another folder.")
+    return _mapped(folder, len(cardinalities), kind)
+
+
+def _types(kind: np.dtype[Any]) -> dict[str, np.dtype[Any]]:
+    """Type of each column in the files, the lower bytes first."""
+    kinds = {"states": kind, "next_states": kind, "terminated": np.dtype(np.bool_), "rewards": np.dtype(np.float64)}
+    return {name: kinds.get(name, np.dtype(np.int64)).newbyteorder("<") for name in _COLUMNS}
+
+
+def _mapped(folder: Path, n_factors: int, kind: np.dtype[Any]) -> TransitionBatch:
+    """The rows that all files have; one that was cut short counts for nothing."""
+    types, columns = _types(kind), []
+    width = {name: n_factors if name in ("states", "next_states") else 1 for name in _COLUMNS}
+    n = min((folder / f"{name}.bin").stat().st_size // max(1, width[name] * types[name].itemsize) for name in _COLUMNS)
+    for name in _COLUMNS:
+        shape = (n, n_factors) if name in ("states", "next_states") else (n,)
+        wide, path = len(shape) == 2, folder / f"{name}.bin"
+        empty = n == 0 or n_factors == 0
+        mapped = np.zeros(shape, dtype=types[name]) if empty else np.memmap(path, dtype=types[name], mode="r", shape=shape)
+        columns.append(mapped if wide else np.array(mapped))
+    return TransitionBatch(*columns)
+
+
+def _write(folder: Path, batch: TransitionBatch, n_before: int) -> None:
+    """Adds rows to the files, after the first ``n_before``."""
+    for (name, kind), kept in zip(_types(batch.before.dtype).items(), _KEPT, strict=True):
+        values = np.ascontiguousarray(getattr(batch, kept), dtype=kind)
+        with (folder / f"{name}.bin").open("r+b") as file:
+            file.seek(n_before * (values.nbytes // len(batch)))
+            file.truncate()
+            file.write(values.data)

@@ -22,6 +22,11 @@ def compiled(function: _F) -> _F:
     return cast("_F", numba.njit(cache=True, nogil=True)(function))
 
 
+def inlined(function: _F) -> _F:
+    """Compile a function into every compiled function that calls it: for small ones that are called very often."""
+    return cast("_F", numba.njit(inline="always")(function))
+
+
 def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
     """Code that makes arrays, or the arrays in a tuple, forget who owns them."""
     if isinstance(kind, types.Array):

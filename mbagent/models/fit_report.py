@@ -118,7 +118,7 @@ def describe(
     if len(rows) == 0:
         return (), None
     start = np.concatenate([[0], np.cumsum(cardinalities)]).astype(np.int64)
-    at = start[:-1] + rows.next_states
+    at = start[:-1] + rows.after
     logs = np.log(np.take_along_axis(probabilities, at, axis=1).clip(1e-12)).mean(axis=0)
     came = np.zeros(probabilities.shape, dtype=np.bool_)
     np.put_along_axis(came, at, True, axis=1)

@@ -124,9 +124,9 @@ def steps_apart(data: TransitionDataset, n: int, seed: int = 0) -> TransitionDat
     first, end = start[whole], last[whole]
     result.append(
         TransitionBatch(
-            states=rows.states[first],
+            before=rows.before[first],
             actions=number_strings(strings[whole], data.n_actions),
-            next_states=rows.next_states[end],
+            after=rows.after[end],
             terminated=over[whole],
             rewards=np.zeros(len(first)),
             episodes=rows.episodes[first],

@@ -10,10 +10,14 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mbagent.spaces import FactoredSpace, PlaneLayout
-from mbagent.transitions import TransitionBatch
+from mbagent.transitions import TransitionBatch, TransitionDataset
 
 SOME_ROWS, SOME_TESTS = 2500, 1000
 """Transitions learned from and held out to look at a question such as this one."""
+
+
+PART = 2000
+"""Transitions looked at at once."""
 
 
 def better(logs: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
@@ -27,12 +31,31 @@ def thinned(rows: TransitionBatch, most: int) -> TransitionBatch:
     return rows.select(np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)) if len(rows) else rows
 
 
+def within(data: TransitionDataset, most: int) -> TransitionDataset:
+    """The dataset, or evenly chosen transitions of it, that have at most so many values of factors."""
+    n = max(1, most // max(1, len(data.cardinalities)))
+    if len(data) <= n:
+        return data
+    smaller = TransitionDataset(data.cardinalities, data.n_actions)
+    smaller.append(thinned(data.rows(), n))
+    return smaller
+
+
 def following_steps(rows: TransitionBatch) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Numbers of the transitions that follow another in the same episode, and of those; episodes may be interleaved."""
     order = np.argsort(rows.episodes, kind="stable")
     earlier, later = order[:-1], order[1:]
-    same = (rows.episodes[later] == rows.episodes[earlier]) & (rows.states[later] == rows.next_states[earlier]).all(axis=1)
+    same = (rows.episodes[later] == rows.episodes[earlier]) & _follow(rows, later, earlier)
     return later[same], earlier[same]
+
+
+def _follow(rows: TransitionBatch, later: NDArray[np.int64], earlier: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which of the later transitions begin where the earlier ones end; looked at in parts."""
+    found = np.zeros(len(later), dtype=np.bool_)
+    for begin in range(0, len(later), PART):
+        part = slice(begin, begin + PART)
+        found[part] = (rows.before[later[part]] == rows.after[earlier[part]]).all(axis=1)
+    return found
 
 
 def steps_in_a_row(rows: TransitionBatch, most: int) -> tuple[TransitionBatch, TransitionBatch]:

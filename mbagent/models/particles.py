@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -47,6 +48,7 @@ class Particles(NamedTuple):
     factors: Ints
 
 
+@lru_cache(maxsize=4096)
 def start(seed: int) -> tuple[np.uint64, float]:
     """The key of a seed and the grid's offset in [0, 1)."""
     key = derive(int(seed) % 2**64, 0x5EED)

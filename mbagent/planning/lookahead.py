@@ -113,10 +113,14 @@ def _grow_compiled(graph: StateGraph, roots: NDArray[np.int64], max_states: int,
     """The same with a model that compiled code can ask: one root after the other."""
     n_actions = graph.model.n_actions
     for root in roots:
-        budget, begin = max_states, len(graph)
+        budget, begin, at_once = max_states, len(graph), 64
         reach, depth = np.zeros(0), np.zeros(0, dtype=np.int64)
         while budget > 0:
-            most = 2 * n_samples * n_actions * min(budget, 64)
+            most = 2 * n_samples * n_actions * min(budget, at_once)
             graph.reserve(most, most)
-            reach, depth = np.resize(reach, len(graph.arrays.tags)), np.resize(depth, len(graph.arrays.tags))
-            budget = grow_around(graph.kernel, graph.arrays, root, begin, budget, n_samples, horizon, seed, reach, depth)
+            more = len(graph.arrays.tags) - len(reach)
+            reach, depth = np.append(reach, np.zeros(more)), np.append(depth, np.zeros(more, dtype=np.int64))
+            left = grow_around(graph.kernel, graph.arrays, root, begin, budget, n_samples, horizon, seed, reach, depth)
+            if left == budget:  # there was no room for all that are about as likely
+                at_once *= 2
+            budget = left

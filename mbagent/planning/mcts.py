@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,7 +125,7 @@ class _Search:
         rollouts = settings.leaf_values == "rollouts"
         prior = 0.0 if rollouts else settings.prior_visits
         # What is carried on must not meet the very luck that it was made of.
-        key = derive(settings.seed, _SEARCH_SALT, *([_CARRIED_SALT, decision] if decision else []))[0]
+        key = derive(settings.seed, _CARRIED_SALT, decision)[0] if decision else _key(settings.seed, 0)
         self.rules = Rules(settings.gamma, settings.c_uct, prior, rollouts, settings.backup == "mean", key)
         if not (rollouts and decision):
             measure_spans(graph.arrays, roots, self.tables)
@@ -174,7 +175,7 @@ class _Search:
         n, n_widened = begin_wave(graph.arrays, self.roots, self.tables, rules, done, paths, leaves)
         n_nodes, n_edges, first = len(graph), graph.n_edges, paths.leaves.size
         draws = self.settings.n_samples if rules.rollouts else LEAF_SAMPLES
-        graph.expand(leaves[:n], draws, int(derive(self.settings.seed, _SEARCH_SALT, done + 1)[0]))
+        graph.expand(leaves[:n], draws, int(_key(self.settings.seed, done + 1)))
         self._make_room()
         self.tables.rewards[n_edges : graph.n_edges] = score_edges(graph, self.planner._known_goal(), n_edges)
         ends = self._rollouts(paths, done) if rules.rollouts else np.empty(paths.ends.shape)
@@ -210,6 +211,13 @@ def _first_tables(solution: Values, roots: Ints) -> Tables:
         solution.v, q, np.zeros_like(q), np.zeros_like(q), solution.rewards, solution.frontier,
         np.zeros((len(roots), q.shape[1])), np.ones(len(roots)), np.stack([spread, spread], axis=1),
     )  # fmt: skip
+
+
+@lru_cache(maxsize=4096)
+def _key(seed: int, wave: int) -> np.uint64:
+    """Key of the search's luck (0), and of what the wave after ``wave - 1`` simulations imagines."""
+    key: np.uint64 = (derive(seed, _SEARCH_SALT) if wave == 0 else derive(seed, _SEARCH_SALT, wave))[0]
+    return key
 
 
 def _longer(table: NDArray[np.float64], size: int) -> Floats:

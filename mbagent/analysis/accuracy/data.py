@@ -84,9 +84,9 @@ class Observations:
         nothing = np.zeros(n * c, dtype=np.int64)
         data.append(
             TransitionBatch(
-                states=np.repeat(self.inputs, c, axis=0),
+                before=np.repeat(self.inputs, c, axis=0),
                 actions=nothing,
-                next_states=self.outputs.reshape(n * c, d),
+                after=self.outputs.reshape(n * c, d),
                 terminated=nothing.astype(np.bool_),
                 rewards=nothing.astype(np.float64),
                 episodes=np.arange(n * c),

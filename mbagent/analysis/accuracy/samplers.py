@@ -134,7 +134,7 @@ def _fit_online(model: NeuralTransitionModel, data: Observations, iterations: in
     rows, rng = data.dataset().rows(), np.random.default_rng(seed)
     for _ in range(iterations):
         for i in rng.permutation(len(rows)):
-            row = rows.select(slice(i, i + 1))  # type: ignore[arg-type]  # any index will do
+            row = rows.select(slice(i, i + 1))  # any index will do
             model.observe(row.states, row.actions, row.next_states, row.terminated)
 
 

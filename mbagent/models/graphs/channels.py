@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -10,39 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.graphs import draws
-from mbagent.models.graphs.compiled import Graphs, build, habit_of
-from mbagent.models.graphs.conditioner import UNCERTAIN, go_together
+from mbagent.models.graphs.compiled import Graphs
+from mbagent.models.graphs.conditioner import UNCERTAIN, go_together, uncertain_rows
 from mbagent.models.graphs.fitting import nothing_late
-from mbagent.models.graphs.greedy import find_splits
 from mbagent.models.graphs.instantiate import COLUMN, ROW, WHOLE, Coupling
+from mbagent.models.graphs.looks import PlaneTable
 from mbagent.models.graphs.search import Search
-from mbagent.models.graphs.units import Layout, Question, Seen, ask, distinct, lay_out
-from mbagent.models.graphs.windows import (
-    ACTION,
-    BORDER,
-    CELL,
-    MEETING,
-    NEXT,
-    NEXT_MEETING,
-    WRAP,
-    column_kinds,
-    column_values,
-    far_value,
-    known_columns,
-    shifted,
-)
+from mbagent.models.graphs.units import Layout, Question, Seen, ask, distinct
+from mbagent.models.graphs.windows import NEXT, column_values, shifted
+from mbagent.models.graphs.zoom import zoom
 from mbagent.spaces import PlaneLayout
 from mbagent.transitions import TransitionBatch
 
 Ints: TypeAlias = NDArray[np.int64]
 Bools: TypeAlias = NDArray[np.bool_]
 Floats: TypeAlias = NDArray[np.float64]
-
-MOST_CELLS = 200_000_000
-"""Entries of the table of columns that the search reads; of more transitions than that, some from all over are searched."""
-
-CHUNK = 50_000_000
-"""Entries of the table that are made at once."""
 
 TOGETHER = 12.0
 """Two bits of a set must have been expected together this often before "never" is believed of them."""
@@ -51,115 +32,21 @@ SOME_CELLS = 100_000
 """Cells that are looked at for errors that go together."""
 
 
-def channel_layout(cardinalities: Sequence[int], n_actions: int) -> Layout:
-    """Channels as the factors of a layout; its own columns mean nothing."""
-    return lay_out(cardinalities, (), n_actions, ordinal=False)
-
-
-class PlaneTable:
-    """Transitions of planes, as cells with their relative columns.
-
-    Attributes:
-        table: columns of the neighbourhood of all cells that look different, bool [looks, near].
-
-    Args:
-        rows: N transitions.
-        board: where cells lie.
-        cardinalities: number of values of each channel's cells, length C.
-        columns: all relative columns, int64 [D, 7].
-        n_actions: number of actions A.
-        since: first row that counts for each channel and for ``terminated``, int64 [C + 1]; None for all.
-        in_pairs: whether to look for causes that matter only together, which takes most of the time.
-    """
-
-    def __init__(
-        self,
-        rows: TransitionBatch,
-        board: PlaneLayout,
-        cardinalities: tuple[int, ...],
-        columns: Ints,
-        n_actions: int,
-        since: Ints | None = None,
-        in_pairs: bool = True,
-    ) -> None:
-        """See the class."""
-        self.in_pairs = in_pairs
-        self.board, self.cardinalities, self.columns, self.n_actions = board, cardinalities, columns, n_actions
-        self.n_cells = board.height * board.width
-        self.since = np.zeros(len(cardinalities) + 1, dtype=np.int64) if since is None else since
-        every = board.to_planes(rows.states), board.to_planes(rows.next_states)
-        known = known_columns(columns, *every)
-        kind = columns[known, 0]
-        here = np.isin(kind, (CELL, BORDER, ACTION, WRAP)) | ((kind == MEETING) & (columns[known, 5:] == 0).all(axis=1))
-        self.near, self.far, self.next_far = (
-            known[which] for which in (here, np.isin(kind, (MEETING, ACTION)), kind == NEXT_MEETING)
-        )
-        self.table, self.pattern, taken = self._looks(every[0], rows.actions)
-        self.rows, self.before, self.after = rows.select(taken), every[0][taken], every[1][taken]
-        self.since = np.searchsorted(taken, self.since)
-        self.actions = np.repeat(self.rows.actions, self.n_cells)
-
-    def _looks(self, planes: Ints, actions: Ints) -> tuple[Bools, Ints, Ints]:
-        """Columns of all cells that look different, which each cell looks like, and which transitions that is of.
-
-        Transitions from all over are taken as long as there is room.
-        """
-        most, step = MOST_CELLS // max(len(self.near), 1), max(1, CHUNK // (self.n_cells * max(len(self.near), 1)))
-        looks, n_parts = np.zeros((0, -(-len(self.near) // 8)), dtype=np.uint8), -(-len(planes) // step)
-        pattern, taken = [np.zeros((0, self.n_cells), dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
-        for number in range(n_parts):
-            if len(looks) >= most:
-                break
-            part = np.arange(number, len(planes), n_parts)
-            packed = np.packbits(column_values(self.columns[self.near], planes[part], actions[part]), axis=1)
-            first, of = distinct(packed)
-            both, known = np.concatenate([looks, packed[first]]), len(looks)
-            kept, now = distinct(both)
-            renamed = np.argsort(np.argsort(kept, kind="stable"), kind="stable")[now]  # looks known before keep their numbers
-            looks = both[np.sort(kept)]
-            pattern.append(renamed[known:][of].reshape(len(part), self.n_cells))
-            taken.append(part)
-        rows = np.concatenate(taken)
-        order = np.argsort(rows)
-        table = np.unpackbits(looks, axis=1, count=len(self.near)).astype(np.bool_)
-        return table, np.concatenate(pattern)[order].ravel(), rows[order]
-
-    def seen(self, channel: int) -> Seen:
-        """A channel's values in all cells; looks are rows of ``table``."""
-        every = Seen(self.pattern, self.actions, self.before[:, channel].reshape(-1), self.after[:, channel].reshape(-1))
-        return every.select(self.cells_since(channel))
-
-    def cells_since(self, channel: int) -> Ints:
-        """Numbers of the cells that count for a channel."""
-        return np.arange(min(self.since[channel] * self.n_cells, len(self.actions)), len(self.actions))
-
-    def far_values(self, numbers: Ints) -> Bools:
-        """Columns that are the same at all positions, bool [N, len(numbers)]."""
-        found = [far_value(self.columns[d], self.before, self.rows.actions, self.after) for d in numbers]
-        return np.stack(found, axis=1)
-
-    def split(self, asked: Sequence[Question], table: Bools, numbers: Ints) -> list[Search]:
-        """Splits by columns of a table, which have these numbers among the relative ones."""
-        kinds = column_kinds(self.columns)[numbers]
-        found = find_splits([q.head for q in asked], table, kinds, self.n_actions, self.in_pairs)
-        return [search.renamed(numbers) for search in found]
-
-    def build(self, asked: Sequence[Question], found: Sequence[Search]) -> Graphs:
-        """Graphs of channels, ``terminated`` and the event that never happens."""
-        seen = [self.seen(channel) for channel in range(len(self.cardinalities))]
-        habits = [habit_of(k, self.n_actions, s.actions, s.now, s.then) for k, s in zip(self.cardinalities, seen, strict=True)]
-        nothing, ends = np.zeros(len(self.rows), dtype=np.int64), self.rows.terminated.astype(np.int64)
-        habits += [habit_of(2, self.n_actions, self.rows.actions, nothing, then) for then in (ends, nothing)]
-        still = 0.5 / (len(self.actions) * len(self.cardinalities) + 1.0)
-        return build(channel_layout(self.cardinalities, self.n_actions), asked, found, habits, still)
-
-
 def learn_channels(planes: PlaneTable) -> tuple[Graphs, list[Question], list[Search]]:
     """Graphs of all channels, each cell for itself, and of ``terminated``."""
     asked: list[Question] = []
+    copied_asked: list[Question] = []
+    copied: list[Search] = []
     for channel, cardinality in enumerate(planes.cardinalities):
-        asked += ask(channel, cardinality, planes.seen(channel))
+        columns = planes.told_by(channel)
+        if columns is None:
+            asked += ask(channel, cardinality, planes.seen(channel))
+        else:
+            questions, table = planes.copying(channel, columns)
+            copied_asked, copied = copied_asked + questions, copied + planes.split(questions, table, columns)
     found = planes.split(asked, planes.table, planes.near) if asked else []
+    found = zoom(planes, asked, found)
+    asked, found = asked + copied_asked, found + copied
     if planes.rows.terminated.any():
         over, searches = _ends(planes, planes.far)
         asked, found = asked + over, found + searches
@@ -187,12 +74,12 @@ def learn_late(planes: PlaneTable, layout: Layout, graphs: Graphs) -> tuple[Grap
     late, asked, found = [], [], []
     for channel, numbers in _dependent(planes, layout, graphs).items():
         units = layout.cells[channel].ravel()
-        needed = draws.uncertain(planes.rows.states, planes.rows.actions, layout, graphs, units)
+        needed = uncertain_rows(planes.rows, layout, graphs, units)
         counting = planes.cells_since(channel)
         kept = np.flatnonzero((needed & (layout.coupling_of[units] < 0)).ravel()[counting])
         some, which = planes.seen(channel).select(kept), counting[kept]
         following = column_values(planes.columns[numbers], planes.before, planes.rows.actions, planes.after)[which]
-        first, pattern = distinct(np.concatenate([some.pattern[:, None], following], axis=1))
+        first, pattern = distinct(following, some.pattern)
         questions = ask(channel, planes.cardinalities[channel], replace(some, pattern=pattern))
         table = np.concatenate([planes.table[some.pattern[first]], following[first]], axis=1)
         searches = planes.split(questions, table, np.concatenate([planes.near, numbers])) if questions else []
@@ -271,7 +158,7 @@ def find_couplings(
     """
     if len(rows) == 0:
         return ()
-    before, after = board.to_planes(rows.states), board.to_planes(rows.next_states)
+    before, after = board.to_planes(rows.before), board.to_planes(rows.after)
     found: list[tuple[float, Coupling]] = []
     for channel in (c for c, k in enumerate(cardinalities) if k == 2):
         count = after[:, channel].sum(axis=(1, 2))
@@ -282,7 +169,7 @@ def find_couplings(
             p = ones[:, channel]
             total, squares = p.sum(axis=axis).reshape(len(p), -1), (p**2).sum(axis=axis).reshape(len(p), -1)
             expected = (total**2 - squares).sum(axis=0) / 2.0 * (len(rows) / max(len(some), 1))
-            alone = after[:, channel].sum(axis=axis).reshape(len(rows), -1).max(axis=0, initial=0) <= 1
+            alone = after[:, channel].sum(axis=axis, dtype=np.int64).reshape(len(rows), -1).max(axis=0, initial=0) <= 1
             for i in np.flatnonzero(alone & (expected > TOGETHER)):
                 line = int(i) if i < (length + 1) // 2 else int(i) - length
                 found.append((float(expected[i]), Coupling(channel, kind, line, False)))

@@ -32,6 +32,16 @@ MOST_ENTRIES = 4_000_000
 """Entries of the table of errors; of more rows, evenly chosen ones are looked at."""
 
 
+AT_ONCE = 2000
+"""Rows that are handed to the compiled kernels at once, which read wide integers."""
+
+
+def uncertain_rows(rows: TransitionBatch, layout: Layout, graphs: Graphs, units: Ints) -> Bools:
+    """In which rows some units need their late graphs, bool [N, len(units)]."""
+    found = [draws.uncertain(part.states, part.actions, layout, graphs, units) for part in rows.parts(AT_ONCE)]
+    return np.concatenate([np.zeros((0, len(units)), dtype=np.bool_), *found])
+
+
 class Asked(NamedTuple):
     """What a unit is asked again with.
 
@@ -95,7 +105,7 @@ def _dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, owner: Int
     probs = probabilities(layout, graphs, rows)
     spread = probs * (1.0 - probs)
     uncertain = np.flatnonzero(spread.sum(axis=0) > UNCERTAIN)
-    error = shown(layout, rows.next_states, uncertain) - probs[:, uncertain]
+    error = shown(layout, rows.after, uncertain) - probs[:, uncertain]
     telling = np.zeros((len(uncertain), len(uncertain)), dtype=np.bool_)
     for action in np.unique(rows.actions):  # what goes together under one action may go apart under another
         e, v = error[rows.actions == action], spread[rows.actions == action][:, uncertain]

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from mbagent.models.base import Bools, States
+from mbagent.models.base import Bools
+from mbagent.transitions import Factors
 
 USUAL = 0.95
 """Share of transitions that are taken for usual in any case."""
 
 
-def flag_events(states: States, next_states: States) -> Bools:
+def flag_events(states: Factors, next_states: Factors) -> Bools:
     """Which transitions look like a rare event, bool [N].
 
     Those that change more than twice as many factors as nearly all others, and those that change factors which otherwise
     never change.
 
     Args:
-        states: int64 [N, F].
-        next_states: int64 [N, F].
+        states: int [N, F].
+        next_states: int [N, F].
     """
     changed = states != next_states
     count = changed.sum(axis=1)

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.base import Bools, States
+from mbagent.models.base import Bools
+from mbagent.transitions import Factors
 
 EXPECTED = 8.0
 """Two bits must have been expected together this often before "never" is believed: else it may be chance, one in 3,000."""
@@ -22,7 +23,7 @@ MOST_ROWS = 50_000
 
 
 def find_groups(
-    cardinalities: Sequence[int], states: States, next_states: States, usual: Bools | None = None
+    cardinalities: Sequence[int], states: Factors, next_states: Factors, usual: Bools | None = None
 ) -> tuple[tuple[int, ...], ...]:
     """Groups of bits of which exactly one is on in every state met.
 
@@ -31,8 +32,8 @@ def find_groups(
 
     Args:
         cardinalities: number of values of each factor, length F.
-        states: int64 [N, F].
-        next_states: int64 [N, F].
+        states: int [N, F].
+        next_states: int [N, F].
         usual: bool [N], transitions to look for swaps in (rare events, which redraw all, swap anything); None: all.
 
     Returns:

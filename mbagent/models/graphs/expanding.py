@@ -26,7 +26,7 @@ from mbagent.models.graphs.lean import (
     touched_units,
 )
 from mbagent.models.particles import FOUND, Particles, begin, new_particles, prune, split
-from mbagent_envs._compiled import compiled
+from mbagent_envs._compiled import compiled, inlined
 
 Grid: TypeAlias = tuple[int, np.uint64, float]
 """Number of draws, their key and offset; see ``particles.py``."""
@@ -129,7 +129,7 @@ def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.u
     return total
 
 
-@compiled
+@inlined
 def _settle(
     touched: Ints,
     units: Ints,
@@ -170,7 +170,7 @@ def _settle(
     return n_live, n_open, ended
 
 
-@compiled
+@inlined
 def _settle_couplings(
     touched: Ints,
     units: Ints,
@@ -205,7 +205,7 @@ def _settle_couplings(
     return n_live, n_open
 
 
-@compiled
+@inlined
 def _write(
     total: int,
     n_live: int,
@@ -243,7 +243,7 @@ def _write(
         probabilities[total + q] = mass[q] / everything if everything >= FOUND else p.points[q] / n_grid
 
 
-@compiled
+@inlined
 def _share(p: Particles, n_live: int, number: int, n_open: int, joint: Floats, n: int, grid: Grid) -> int:
     """Shares all particles among the values of a unit or coupling that is uncertain; returns how many there are."""
     prune(joint, n)
@@ -252,7 +252,7 @@ def _share(p: Particles, n_live: int, number: int, n_open: int, joint: Floats, n
     return n_live
 
 
-@compiled
+@inlined
 def _couple(
     coupling: int, first: int, touched: Ints, units: Ints, exactly: bool, rates: Floats, coupled: Ints, out: Floats
 ) -> int:
@@ -274,14 +274,14 @@ def _couple(
     return settled(out, 0, n + 1)
 
 
-@compiled
+@inlined
 def _choose(state: Ints, coupled: Ints, first: int, n: int, chosen: int, units: Ints, members: Ints) -> None:
     """Switches one of a coupling's listed bits on and the others off."""
     for k in range(n):
         state[members[units[coupled[first + k], FIRST]]] = 1 if k == chosen else 0
 
 
-@compiled
+@inlined
 def _put(state: Ints, unit: int, value: int, units: Ints, members: Ints) -> None:
     """Gives a unit its value."""
     first, n = units[unit, FIRST], units[unit, MEMBERS]

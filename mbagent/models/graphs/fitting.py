@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mbagent.models.graphs import draws
 from mbagent.models.graphs.compiled import Graphs, build, habit_of
-from mbagent.models.graphs.conditioner import find_dependent
+from mbagent.models.graphs.conditioner import find_dependent, uncertain_rows
 from mbagent.models.graphs.exclusive import find_cliques, find_groups
 from mbagent.models.graphs.greedy import find_splits
 from mbagent.models.graphs.search import Search
@@ -81,11 +81,11 @@ class _Table:
             self.since[-2] = since[-1]
         lone = np.flatnonzero(np.diff(layout.first) == 1)
         self.moving = lone[np.isin(layout.members[layout.first[lone]], list(moving))]
-        flags = np.stack([rows.terminated, events], axis=1).astype(np.int64)
-        self.now = np.concatenate([unit_values(layout, rows.states), np.zeros_like(flags)], axis=1)
-        self.then = np.concatenate([unit_values(layout, rows.next_states), flags], axis=1)
-        first, self.pattern = distinct(np.concatenate([rows.states, rows.actions[:, None]], axis=1))
-        self.first, self.columns = first, column_table(layout, rows.states[first], rows.actions[first])
+        flags = np.stack([rows.terminated, events], axis=1).astype(np.uint8)
+        self.now = np.concatenate([unit_values(layout, rows.before), np.zeros_like(flags)], axis=1)
+        self.then = np.concatenate([unit_values(layout, rows.after), flags], axis=1)
+        first, self.pattern = distinct(rows.before, rows.actions)
+        self.first, self.columns = first, column_table(layout, rows.before[first], rows.actions[first])
 
     def ask(self, unit: int, which: Ints) -> list[Question]:
         """The questions about a unit, of some rows."""
@@ -102,20 +102,20 @@ class _Table:
 
     def seen(self, unit: int) -> Seen:
         """A unit's values in all rows."""
-        return Seen(self.pattern, self.rows.actions, self.now[:, unit], self.then[:, unit])
+        now, then = (values[:, unit].astype(np.int64) for values in (self.now, self.then))
+        return Seen(self.pattern, self.rows.actions, now, then)
 
     def kinds(self, seen: Ints) -> Ints:
         """Kind of each column, by some rows."""
-        changing = (self.rows.states[seen] != self.rows.next_states[seen]).any(axis=0)
-        return column_kinds(self.layout, self.rows.states[seen], changing)
+        changing = (self.rows.before[seen] != self.rows.after[seen]).any(axis=0)
+        return column_kinds(self.layout, self.rows.before[seen], changing)
 
     def build(self, asked: Sequence[Question], found: Sequence[Search], seen: Ints, still: float) -> Graphs:
         """The graphs; habits are those of the rows seen."""
         habits = []
         for unit, cardinality in enumerate(self.layout.outputs):
-            some = self.counting(unit, seen)
-            actions, now, then = self.rows.actions[some], self.now[some, unit], self.then[some, unit]
-            habits.append(habit_of(int(cardinality), self.layout.n_actions, actions, now, then))
+            some = self.seen(unit).select(self.counting(unit, seen))
+            habits.append(habit_of(int(cardinality), self.layout.n_actions, some.actions, some.now, some.then))
         return build(self.layout, asked, found, habits, still)
 
 
@@ -146,7 +146,7 @@ def fit_graphs(
         moving: factors that are asked how far they move, and not where they go.
         since: first row that counts for each factor and for ``terminated``, int64 [F + 1]; None for all.
     """
-    groups = find_groups(cardinalities, rows.states, rows.next_states, ~events)
+    groups = find_groups(cardinalities, rows.before, rows.after, ~events)
     layout = lay_out(cardinalities, groups, n_actions)
     table, usual = _Table(layout, rows, events, moving, since), np.flatnonzero(~events)
     last = len(layout.outputs) - 1
@@ -172,10 +172,10 @@ def _late_graphs(
     late, all_asked, all_found = [], [], []
     for unit, columns in find_dependent(layout, graphs, rows, usual):
         counting = table.counting(unit, usual)
-        needed = draws.uncertain(rows.states[counting], rows.actions[counting], layout, graphs, np.asarray([unit]))[:, 0]
+        needed = uncertain_rows(rows.select(counting), layout, graphs, np.asarray([unit]))[:, 0]
         some = table.seen(unit).select(counting[needed])
-        following = shown(layout, rows.next_states[counting[needed]], columns)
-        first, pattern = distinct(np.concatenate([some.pattern[:, None], following], axis=1))
+        following = shown(layout, rows.after[counting[needed]], columns)
+        first, pattern = distinct(following, some.pattern)
         asked = table.questions(unit, replace(some, pattern=pattern))
         more_kinds = np.concatenate([kinds, kinds.max(initial=0) + 1 + kinds[columns]])
         more = np.concatenate([table.columns[some.pattern[first]], following[first]], axis=1)
@@ -197,11 +197,12 @@ def _coupled(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Layout:
     if len(bits) < 2 or len(rows) == 0:
         return layout
     factors = layout.members[layout.first[bits]]
-    on = rows.next_states[:, factors].astype(np.float32)
+    on = rows.after[:, factors].astype(np.float32)
     some = np.linspace(0, len(rows) - 1, min(len(rows), SOME_ROWS)).astype(np.int64)
     start = np.concatenate([[0], np.cumsum(_cardinalities(layout))]).astype(np.int64)
     probs = np.empty((len(some), int(start[-1])))
-    draws.marginals(rows.states[some], rows.actions[some], layout, graphs, start, probs)
+    few = rows.select(some)
+    draws.marginals(few.states, few.actions, layout, graphs, start, probs)
     ones = probs[:, start[factors] + 1]
     expected = ones.T @ ones * (len(rows) / len(some))
     return coupled_layout(layout, [bits[c] for c in find_cliques(np.rint(on.T @ on).astype(np.int64), expected)])

@@ -38,8 +38,12 @@ def find_splits(heads: Sequence[Head], table: Bools, kinds: Ints, n_actions: int
     columns = columns_of(table)
     most = max((int(head.seen.sum()) for head in heads), default=0) + 1
     first = _searched(heads, table, columns, kinds, n_actions, evidence_tables(most), False)
-    certain = min(best_prior(first).certain, SUREST)
-    return _searched(heads, table, columns, kinds, n_actions, evidence_tables(most, certain), in_pairs)
+    return _searched(heads, table, columns, kinds, n_actions, evidence_tables(most, certainty(first)), in_pairs)
+
+
+def certainty(searches: Sequence[Search]) -> float:
+    """Share of what was found that is not random at all, as believed of the rest."""
+    return min(best_prior(searches).certain, SUREST)
 
 
 def _searched(
@@ -48,6 +52,14 @@ def _searched(
     searches = [Search(head) for head in heads]
     for search in searches:
         search.merge(tables)
+    go_on(searches, table, columns, kinds, n_actions, tables, in_pairs)
+    return searches
+
+
+def go_on(
+    searches: Sequence[Search], table: Bools, columns: Columns, kinds: Ints, n_actions: int, tables: Tables, in_pairs: bool
+) -> None:
+    """Divides further as long as evidence grows; see ``find_splits``."""
     pairs = PairSearch(kinds, table, tables)
     going = True
     while going:
@@ -56,7 +68,6 @@ def _searched(
                 searches[h].divide(chosen, table, tables)
                 searches[h].open = len(searches[h].splits) < MOST_SPLITS
         going = in_pairs and pairs.divide(searches)
-    return searches
 
 
 def _next_splits(

@@ -1,7 +1,7 @@
 """Decision graphs as few flat arrays, and which units a state touches: what planning with them need not look at.
 
 In a state where everything is 0, each unit has a *usual* distribution for each action; mostly it stays as it is. In another
-state only those units can differ that ask for a column in which the states differ, or that differ themselves. With few
+state only those units can differ that usually ask for a column in which the states differ, or that differ themselves. With few
 things on a board these are few, whatever its size.
 Shapes: A actions, U units, F factors, R values of all factors, W words of 64 units, M meetings, Q couplings.
 """
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, distributions, n_columns, show
 from mbagent.models.graphs.draws import settled
 from mbagent.models.graphs.units import Layout
-from mbagent_envs._compiled import compiled
+from mbagent_envs._compiled import compiled, inlined
 
 Words: TypeAlias = NDArray[np.uint64]
 
@@ -93,7 +93,7 @@ def lean(layout: Layout, graphs: Graphs, cardinalities: tuple[int, ...]) -> Lean
     shown = np.searchsorted(layout.factor, np.arange(layout.n_factors + 1)).astype(np.int64)
     always = np.zeros((layout.n_actions, n_words), dtype=np.uint64)
     _usual(layout, graphs, nothing, on, always)
-    _dependents(layout, graphs, row, touched, by_meeting)
+    _dependents(layout, graphs, row, nothing, on, touched, by_meeting)
     show(nothing, 0, layout, on)
     on[len(layout.factor) : len(layout.factor) + layout.n_actions] = False
     sizes = np.diff(layout.first)
@@ -146,45 +146,33 @@ def _usual(layout: Layout, graphs: Graphs, nothing: Ints, on: Bools, always: Wor
 
 
 @compiled
-def _dependents(layout: Layout, graphs: Graphs, row: Ints, touched: Words, by_meeting: Words) -> None:
-    """Fills the last two arguments; see Lean."""
+def _dependents(layout: Layout, graphs: Graphs, row: Ints, nothing: Ints, on: Bools, touched: Words, by_meeting: Words) -> None:
+    """Fills the last two arguments; see Lean.
+
+    Where everything is 0, a unit's graphs are followed to their usual leaves; as long as the columns asked on these ways are as
+    usual, nothing else can be found. So only these touch the unit.
+    """
     first_action, first_meeting = len(layout.factor), len(layout.factor) + layout.n_actions
-    met, found = np.full(len(graphs.column), -1, dtype=np.int64), np.empty(len(graphs.column), dtype=np.int64)
     for unit in range(len(layout.outputs) - 2):
         if layout.coupling_of[unit] >= 0 or (graphs.changing == unit).any():
             for factor in layout.members[layout.first[unit] : layout.first[unit + 1]]:
                 for r in range(row[factor] + 1, row[factor + 1]):
                     for table in range(len(touched)):
                         set_bit(touched[table, r], unit)
-    for unit in graphs.changing:
-        for action in range(layout.n_actions):
-            table, pair = action if len(touched) > 1 else 0, graphs.pairs[unit] + action * layout.outputs[unit]
-            n = _asked(graphs, pair, pair + layout.outputs[unit], unit * layout.n_actions + action, met, found)
-            for column in graphs.column[found[:n]]:
-                if column >= first_meeting:
-                    set_bit(by_meeting[table, column - first_meeting], unit)
-                elif 0 <= column < first_action:
-                    _touch(column, unit, layout, row, touched[table])
-
-
-@compiled
-def _asked(graphs: Graphs, first_pair: int, last_pair: int, visit: int, met: Ints, found: Ints) -> int:
-    """Writes all nodes of the graphs of some pairs to ``found``; returns how many; ``met`` tells the last visit to each."""
-    n, done = 0, 0
-    for entry in range(graphs.entries[first_pair], graphs.entries[last_pair]):
-        if met[graphs.nodes[entry]] != visit:
-            met[graphs.nodes[entry]], found[n] = visit, graphs.nodes[entry]
-            n += 1
-    while done < n:
-        node = found[done]
-        done += 1
-        if graphs.column[node] < 0:
-            continue
-        for following in (graphs.on[node], graphs.off[node]):
-            if met[following] != visit:
-                met[following], found[n] = visit, following
-                n += 1
-    return n
+    for action in range(layout.n_actions):
+        table = action if len(touched) > 1 else 0
+        show(nothing, action, layout, on)
+        for unit in graphs.changing:
+            pair = graphs.pairs[unit] + action * layout.outputs[unit]
+            for entry in range(graphs.entries[pair], graphs.entries[pair + 1]):
+                node = graphs.nodes[entry]
+                while graphs.column[node] >= 0:
+                    column = graphs.column[node]
+                    if column >= first_meeting:
+                        set_bit(by_meeting[table, column - first_meeting], unit)
+                    elif column < first_action:
+                        _touch(column, unit, layout, row, touched[table])
+                    node = graphs.on[node] if on[column] else graphs.off[node]
 
 
 @compiled
@@ -197,7 +185,7 @@ def _touch(column: int, unit: int, layout: Layout, row: Ints, touched: Words) ->
             set_bit(touched[r], unit)
 
 
-@compiled
+@inlined
 def show_state(state: Ints, shown: Ints, columns: Ints, different: Ints, on: Bools) -> int:
     """Writes factors that are not 0 to ``different`` and shows their columns; returns how many."""
     n = 0
@@ -211,7 +199,7 @@ def show_state(state: Ints, shown: Ints, columns: Ints, different: Ints, on: Boo
     return n
 
 
-@compiled
+@inlined
 def touched_units(
     action: int,
     state: Ints,
@@ -251,7 +239,7 @@ def touched_units(
     return n
 
 
-@compiled
+@inlined
 def value_of(unit: int, state: Ints, units: Ints, members: Ints) -> int:
     """A unit's present value."""
     first, n = units[unit, FIRST], units[unit, MEMBERS]
@@ -263,7 +251,7 @@ def value_of(unit: int, state: Ints, units: Ints, members: Ints) -> int:
     return 0
 
 
-@compiled
+@inlined
 def rates_of(
     touched: Ints,
     state: Ints,

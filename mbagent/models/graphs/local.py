@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from mbagent.models.base import Bools, FitReport, Floats
 from mbagent.models.fit_report import Variable
 from mbagent.models.graphs.arrays import from_arrays, table_of, to_arrays
-from mbagent.models.graphs.channels import PlaneTable, channel_layout, find_couplings, learn_channels, learn_late
+from mbagent.models.graphs.channels import find_couplings, learn_channels, learn_late
 from mbagent.models.graphs.compiled import Graphs, build, habit_of
 from mbagent.models.graphs.evidence import Ints
 from mbagent.models.graphs.fitting import Fitted, nothing_late
 from mbagent.models.graphs.instantiate import Coupling, LocalGraphs, instantiate, with_couplings
+from mbagent.models.graphs.looks import PlaneTable, channel_layout
 from mbagent.models.graphs.model import FORETOLD, DecisionGraphModel
 from mbagent.models.graphs.parents import asked_columns, hangs_on_action
 from mbagent.models.graphs.recency import still_true_since
@@ -55,7 +56,8 @@ class LocalGraphModel(DecisionGraphModel):
                 f"LocalGraphModel needs planes whose cells have equally many values in each channel, got {space.space}; "
                 "use DecisionGraphModel."
             )
-        self.board, self.given = space.planes, reach
+        self.board, self.given, self.searched = space.planes, reach, 0
+        self.counted = 0
         self._forget(cards, reach or Reach())
 
     def _forget(self, cards: tuple[int, ...], reach: Reach) -> None:
@@ -87,7 +89,8 @@ class LocalGraphModel(DecisionGraphModel):
         if progress is not None:
             progress(1.0)
         figures = {"nodes": float(len(self.local.graphs.column)), "couplings": float(len(self.local.couplings))}
-        figures["changed"] = float((since > 0).sum())
+        figures |= {"changed": float((since > 0).sum()), "searched": float(self.searched)}
+        figures["left out"] = float(len(rows) - self.counted)
         report = self._report((len(rows), len(held_out)), likelihood, exact, figures)
         memory = self._memory(train, held_out)
         report = replace(report, variables=variables, calibration=calibration, memory=memory)
@@ -158,6 +161,7 @@ class LocalGraphModel(DecisionGraphModel):
         """Graphs first, each cell for itself; then what is never on together, and what hangs on what others become."""
         local = self.local
         planes = PlaneTable(rows, self.board, local.cardinalities, local.columns, self.n_actions, since, in_pairs)
+        self.searched, self.counted = len(planes.rows), len(planes.every_action)
         graphs, asked, found = learn_channels(planes)
         self.local = replace(local, graphs=graphs, late=nothing_late(graphs), couplings=())
         self._instantiate((), ())

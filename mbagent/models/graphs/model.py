@@ -18,6 +18,7 @@ from mbagent.models.base import (
 from mbagent.models.fit_report import Variable, VariableReport, describe
 from mbagent.models.graphs.arrays import from_arrays, table_of, to_arrays
 from mbagent.models.graphs.compiled import Graphs, build, habit_of, n_columns
+from mbagent.models.graphs.conditioner import AT_ONCE
 from mbagent.models.graphs.events import flag_events
 from mbagent.models.graphs.exclusive import find_groups
 from mbagent.models.graphs.fitting import Fitted, fit_graphs, nothing_late
@@ -25,7 +26,7 @@ from mbagent.models.graphs.parents import flat_variables
 from mbagent.models.graphs.predictions import GraphPredictions
 from mbagent.models.graphs.recency import still_true_since
 from mbagent.models.graphs.units import coupled_layout, is_lone_bit, lay_out
-from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, steps_in_a_row, thinned, with_past
+from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, steps_in_a_row, thinned, with_past, within
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.transitions import TransitionBatch, TransitionDataset
 
@@ -37,6 +38,10 @@ FEWEST = 4
 
 ENOUGH, MOST_SPLITS = 5, 10
 """So many held-out rare events tell whether they are events at all; where one split has fewer, others follow, up to so many."""
+
+MOST_VALUES = 200_000_000
+"""Values of factors that are learned from at once, which takes up to some ten bytes each; of more transitions than have so
+many, evenly chosen ones are."""
 
 MOST_COUNTS = 20_000_000
 """Contexts times columns of a question about how far a factor moves."""
@@ -76,13 +81,14 @@ class DecisionGraphModel(GraphPredictions):
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel."""
-        began = time.perf_counter()
+        began, n_met = time.perf_counter(), len(data)
+        data = within(data, MOST_VALUES)
         rows, events = data.rows(), self._events(data, seed)
         since = self._since(rows, events)
         train, held_out, train_since = self._split(data, seed, since)
         if progress is not None:
             progress(0.4)
-        flagged = flag_events(train.states, train.next_states) & events.any()
+        flagged = flag_events(train.before, train.after) & events.any()
         moving = self._moving(train, flagged, held_out)
         self.fitted = fit_graphs(self.cardinalities, self.n_actions, train, flagged, moving=moving, since=train_since)
         likelihood, jointly = self._jointly(held_out)
@@ -93,7 +99,7 @@ class DecisionGraphModel(GraphPredictions):
         if progress is not None:
             progress(1.0)
         figures = {"nodes": float(len(self.fitted.usual.column)), "events": float(events.sum())}
-        figures["changed"] = float((since > 0).sum())
+        figures |= {"changed": float((since > 0).sum()), "left out": float(n_met - len(rows))}
         report = self._report((len(rows), len(held_out)), likelihood, exact, figures)
         memory = self._memory(train, held_out)
         report = replace(report, variables=variables, calibration=calibration, memory=memory)
@@ -137,7 +143,7 @@ class DecisionGraphModel(GraphPredictions):
         before = self._kept()
         self._look(train)
         probs, start = self.marginals(tests.states, tests.actions), np.concatenate([[0], np.cumsum(self.cardinalities)])
-        chosen = np.take_along_axis(probs, start[:-1] + tests.next_states, axis=1)
+        chosen = np.take_along_axis(probs, start[:-1] + tests.after, axis=1)
         ends = [
             self.log_prob(tests.states, tests.actions, tests.next_states, np.full(len(tests), over)) for over in (False, True)
         ]
@@ -185,7 +191,7 @@ class DecisionGraphModel(GraphPredictions):
 
     def _look(self, rows: TransitionBatch) -> None:
         """Learns quickly."""
-        events = flag_events(rows.states, rows.next_states) & self.fitted.has_event
+        events = flag_events(rows.before, rows.after) & self.fitted.has_event
         self.fitted = fit_graphs(self.cardinalities, self.n_actions, rows, events, True, False)
 
     def _kept(self) -> Any:
@@ -219,16 +225,16 @@ class DecisionGraphModel(GraphPredictions):
     def _events(self, data: TransitionDataset, seed: int) -> Bools:
         """Which rows are rare events; none if held-out transitions are foretold better without."""
         rows = data.rows()
-        events, gain, tested = flag_events(rows.states, rows.next_states), 0.0, 0
+        events, gain, tested = flag_events(rows.before, rows.after), 0.0, 0
         for split in range(MOST_SPLITS if events.sum() >= FEWEST else 0):
             train, held_out = data.split(self.validation, seed + split)
-            seen = flag_events(train.states, train.next_states)
+            seen = flag_events(train.before, train.after)
             with_events, without = (
                 self._likelihood(fit_graphs(self.cardinalities, self.n_actions, train, flags, False, False), held_out)
                 for flags in (seen, np.zeros_like(seen))
             )
             gain += (with_events - without) * len(held_out)
-            tested += int(flag_events(held_out.states, held_out.next_states).sum())
+            tested += int(flag_events(held_out.before, held_out.after).sum())
             if tested >= ENOUGH:
                 break
         return events & (gain > 0.0)
@@ -243,21 +249,23 @@ class DecisionGraphModel(GraphPredictions):
         for moving in ((), every):
             self.fitted = fit_graphs(self.cardinalities, self.n_actions, train, events, False, False, moving)
             probs = self.marginals(held_out.states, held_out.actions)
-            chosen = np.take_along_axis(probs, start[every] + held_out.next_states[:, every], axis=1)
+            chosen = np.take_along_axis(probs, start[every] + held_out.after[:, every], axis=1)
             logs.append(np.log(chosen.clip(1e-9)).sum(axis=0))
         return [f for f, gain in zip(every, logs[1] - logs[0], strict=True) if gain > 0.0]
 
     def _likelihood(self, fitted: Fitted, rows: TransitionBatch) -> float:
         """Mean log-probability of transitions; the impossible counts as ``IMPOSSIBLE``."""
         before, self.fitted = self.fitted, fitted
-        logs = self.log_prob(rows.states, rows.actions, rows.next_states, rows.terminated)
-        self.fitted = before
+        parts = [self.log_prob(p.states, p.actions, p.next_states, p.terminated) for p in rows.parts(AT_ONCE)]
+        self.fitted, logs = before, np.concatenate([np.zeros(0), *parts])
         return float(np.maximum(logs, IMPOSSIBLE).mean()) if len(logs) else 0.0
 
     def _exact_match(self, rows: TransitionBatch) -> float:
-        states, terminated = self.likeliest(rows.states, rows.actions)
-        hit = (states == rows.next_states).all(axis=1) & (terminated == rows.terminated)
-        return float(hit.mean()) if len(hit) else 1.0
+        hits = 0
+        for part in rows.parts(AT_ONCE):
+            states, terminated = self.likeliest(part.states, part.actions)
+            hits += int(((states == part.after).all(axis=1) & (terminated == part.terminated)).sum())
+        return hits / len(rows) if len(rows) else 1.0
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """See TransitionModel."""

@@ -43,6 +43,9 @@ MOST_CONTEXTS = 4
 """Contexts of a head that pairs are looked for in, the most mixed ones."""
 
 
+MOST_COLUMNS = 500
+"""Columns that pairs are made of; of more, those that tell most by themselves."""
+
 EXACT = 2**24
 """Sums up to here are exact in single precision."""
 
@@ -125,10 +128,24 @@ def find_pairs(head: Head, contexts: Sequence[int], table: Bools, prior: Floats,
     found: list[Pair] = []
     for context in contexts:
         rows = head.context == context
-        if head.seen[rows].sum() >= FEWEST and rows.sum() * table.shape[1] ** 2 < MOST_WORK:
-            found += _in_context(context, table[head.rows[rows]], head.seen[rows], head.came[rows], prior, patterns, tables)
+        if head.seen[rows].sum() >= FEWEST and rows.sum() * min(table.shape[1], MOST_COLUMNS) ** 2 < MOST_WORK:
+            here, seen, came = table[head.rows[rows]], head.seen[rows], head.came[rows]
+            kept = _telling_most(here, seen, came, tables)
+            pairs = _in_context(context, here[:, kept], seen, came, prior[np.ix_(kept, kept)], patterns, tables)
+            found += [pair._replace(first=int(kept[pair.first]), second=int(kept[pair.second])) for pair in pairs]
     best = max(found, default=None)
     return [] if best is None else [pair for pair in found if pair.context == best.context]
+
+
+def _telling_most(table: Bools, seen: Ints, came: Ints, tables: Tables) -> Ints:
+    """Numbers of the columns that pairs are made of, ascending: all of them, or those that tell most by themselves."""
+    n_columns = table.shape[1]
+    if n_columns <= MOST_COLUMNS:
+        return np.arange(n_columns)
+    on = table.T.astype(np.float64)
+    n, e = (np.rint(on @ weights).astype(np.int64) for weights in (seen, came))
+    gain = evidences(e, n, tables) + evidences(came.sum() - e, seen.sum() - n, tables)
+    return np.sort(np.argsort(-gain, kind="stable")[:MOST_COLUMNS])
 
 
 def _in_context(

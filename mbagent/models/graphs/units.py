@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.base import hash_rows
 from mbagent.models.graphs.evidence import Head
+from mbagent.transitions import Factors
+from mbagent_envs.random_keys import derive
 
 Ints: TypeAlias = NDArray[np.int64]
 Bools: TypeAlias = NDArray[np.bool_]
@@ -110,7 +112,7 @@ def _columns_of(factor: int, cardinality: int, ordinal: bool) -> list[tuple[int,
     return columns
 
 
-def shown(layout: Layout, states: Ints, columns: Ints | None = None) -> Bools:
+def shown(layout: Layout, states: Factors, columns: Ints | None = None) -> Bools:
     """Which state columns are on in states [B, F], bool [B, D'], or [B, K] of those ``columns`` [K]."""
     which = np.arange(len(layout.factor)) if columns is None else columns
     values = states[:, layout.factor[which]]
@@ -137,16 +139,16 @@ def is_lone_bit(layout: Layout) -> Bools:
     return result
 
 
-def unit_values(layout: Layout, states: Ints) -> Ints:
-    """Value of each unit of factors, int64 [B, U - 2], in states [B, F]; in a group the first bit that is on counts."""
-    values = np.empty((len(states), len(layout.outputs) - 2), dtype=np.int64)
+def unit_values(layout: Layout, states: Factors) -> Factors:
+    """Value of each unit of factors, [B, U - 2], in states [B, F], as narrow as can be; in a group the first bit on counts."""
+    values = np.empty((len(states), len(layout.outputs) - 2), dtype=np.min_scalar_type(int(layout.outputs.max()) - 1))
     for unit in range(values.shape[1]):
         members = layout.members[layout.first[unit] : layout.first[unit + 1]]
         values[:, unit] = states[:, members[0]] if len(members) == 1 else states[:, members].argmax(axis=1)
     return values
 
 
-def column_table(layout: Layout, states: Ints, actions: Ints) -> Bools:
+def column_table(layout: Layout, states: Factors, actions: Ints) -> Bools:
     """Which columns are on, bool [B, D]: those of states [B, F], then those of actions [B]."""
     return np.concatenate(
         [shown(layout, states), actions[:, None] == np.arange(layout.n_actions)],
@@ -154,7 +156,7 @@ def column_table(layout: Layout, states: Ints, actions: Ints) -> Bools:
     )
 
 
-def column_kinds(layout: Layout, states: Ints, changing: Bools) -> Ints:
+def column_kinds(layout: Layout, states: Factors, changing: Bools) -> Ints:
     """Which kind of thing each column is, int64 [D], by what can be seen without knowing the world.
 
     The values of one unit are one kind; so are all bits that change, and all actions; bits that stay fall in two kinds by
@@ -273,7 +275,21 @@ def _question(unit: int, came: Ints, value: int, cardinality: int, seen: Seen, e
     return Question(unit, np.full(len(pairs), value), pairs, head)
 
 
-def distinct(table: NDArray[np.generic]) -> tuple[Ints, Ints]:
-    """Numbers of rows that look different [P], and which of them each row [N] looks like, int64 [N]."""
-    _, first, pattern = np.unique(hash_rows(table), return_index=True, return_inverse=True)
+AT_ONCE = 20_000_000
+"""Entries of a table whose rows are told apart at once."""
+
+
+def distinct(table: NDArray[Any], besides: Ints | None = None) -> tuple[Ints, Ints]:
+    """Numbers of rows that look different [P], and which of them each row [N] looks like, int64 [N].
+
+    Args:
+        table: integers or booleans [N, D].
+        besides: one more column, int64 [N].
+    """
+    step = max(1, AT_ONCE // max(table.shape[1], 1))
+    parts = [hash_rows(table[begin : begin + step]) for begin in range(0, len(table), step)]
+    tags = np.concatenate([np.zeros(0, dtype=np.uint64), *parts])
+    if besides is not None:
+        tags = derive(tags, besides.astype(np.uint64))
+    _, first, pattern = np.unique(tags, return_index=True, return_inverse=True)
     return first, pattern.astype(np.int64)

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.graphs.units import BEYOND
+from mbagent.transitions import Factors
+from mbagent_envs._compiled import compiled
 
 Ints: TypeAlias = NDArray[np.int64]
 _T = TypeVar("_T", bound=np.generic)
@@ -42,6 +44,9 @@ class Reach(NamedTuple):
     radius: int = 1
     wrap: bool = False
 
+
+PIECE = 2000
+"""Cells whose neighbourhoods are looked at together."""
 
 NEXT_RADIUS = 2
 """Rows and columns that a neighbourhood in the next state reaches: two places that a thing may go to lie so far apart."""
@@ -82,29 +87,29 @@ def _meetings(shown: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int, int,
             yield (*first, BEYOND, 0, dy, dx)
 
 
-def known_columns(columns: Ints, before: Ints, after: Ints) -> Ints:
+def known_columns(columns: Ints, before: Factors, after: Factors) -> Ints:
     """Numbers of the relative columns that may tell something, by what was met.
 
     Values that were never met tell nothing, nor do meetings of channels that only repeat another channel's past, or that are
-    the same all over the board.
+    the same all over the board; of the latter one cell tells all.
 
     Args:
         columns: int64 [D, 7].
-        before: planes, int64 [N, C, H, W].
+        before: planes, int [N, C, H, W].
         after: those of the next states.
     """
     n_channels = before.shape[1]
-    met = [set(np.unique(before[:, channel]).tolist()) for channel in range(n_channels)]
+    met = [_values(before[:, channel]) for channel in range(n_channels)]
+    even = {c for c in range(n_channels) if all((p[:, c] == p[:, c, :1, :1]).all() for p in (before, after))}
     live = {BEYOND} | {
         c
         for c in range(n_channels)
-        if not (before[:, c] == before[:, c, :1, :1]).all()
-        and not any(_repeats(after[:, c], before[:, other]) for other in range(n_channels) if other != c)
+        if c not in even and not any(_repeats(after[:, c], before[:, other]) for other in range(n_channels) if other != c)
     }
 
     def known(kind: int, channel: int, value: int, other: int, second: int) -> bool:
         if kind in (CELL, NEXT, WRAP):
-            return value in met[channel]
+            return value in met[channel] and (channel not in even or (kind != WRAP and (other, second) == (0, 0)))
         if kind not in (MEETING, NEXT_MEETING):
             return True
         return channel in live and other in live and value in met[channel] and (other == BEYOND or second in met[other])
@@ -112,20 +117,56 @@ def known_columns(columns: Ints, before: Ints, after: Ints) -> Ints:
     return np.flatnonzero([known(*column[:5]) for column in columns.tolist()])
 
 
-def _repeats(after: Ints, before: Ints) -> bool:
+def _values(plane: Factors) -> set[int]:
+    """Values of a plane [N, H, W]; they are few, and sorting all cells takes long."""
+    return {value for value in range(int(plane.max(initial=0)) + 1) if (plane == value).any()}
+
+
+def _repeats(after: Factors, before: Factors) -> bool:
     some = slice(0, 100)
     return bool((after[some] == before[some]).all() and (after == before).all())
 
 
-def column_values(columns: Ints, planes: Ints, actions: Ints, after: Ints | None = None) -> Bools:
+def told_by(channel: int, columns: Ints, numbers: Ints, before: Factors, after: Factors, actions: Ints) -> Ints | None:
+    """Numbers of the columns that alone tell what a channel becomes everywhere: another's present values, or an action.
+
+    Args:
+        channel: the channel.
+        columns: int64 [D, 7].
+        numbers: those that may be taken, int64 [K].
+        before: planes, int [N, C, H, W].
+        after: those of the next states.
+        actions: int64 [N].
+
+    Returns:
+        Numbers, or None where no other channel or action does.
+    """
+    here = numbers[(columns[numbers, 0] == CELL) & (columns[numbers, 3:5] == 0).all(axis=1)]
+    for other in np.unique(columns[here, 1]):
+        if other != channel and _repeats(after[:, channel], before[:, other]):
+            told: Ints = here[columns[here, 1] == other]
+            return told
+    for number in numbers[columns[numbers, 0] == ACTION]:
+        taken = (actions == columns[number, 1])[:, None, None]
+        if _repeats(after[:, channel], np.broadcast_to(taken, after[:, channel].shape).astype(after.dtype)):
+            return np.asarray([number])
+    return None
+
+
+def column_values(columns: Ints, planes: Factors, actions: Ints, after: Factors | None = None) -> Bools:
     """Which columns are on for every transition and position, bool [N * P, D], positions of a transition together.
 
     Args:
         columns: relative columns, int64 [D, 7].
-        planes: int64 [N, C, H, W].
+        planes: int [N, C, H, W].
         actions: int64 [N].
         after: the next states' planes, for columns of the kind NEXT.
     """
+    return np.ascontiguousarray(column_planes(columns, planes, actions, after).reshape(len(columns), -1).T)
+
+
+def column_planes(columns: Ints, planes: Factors, actions: Ints, after: Factors | None = None) -> Bools:
+    """As ``column_values``, one column after another, bool [D, N, H, W]."""
     n, _, height, width = planes.shape
     table = np.empty((len(columns), n, height, width), dtype=np.bool_)
     inside = np.ones((height, width), dtype=np.bool_)
@@ -139,17 +180,60 @@ def column_values(columns: Ints, planes: Ints, actions: Ints, after: Ints | None
         else:
             shown = _shown(kind, planes, after)[:, parts[0]] == parts[1]
             table[d] = wrapped(shown, *parts[2:4]) if kind == WRAP else shifted(shown, *parts[2:4])
-    return np.ascontiguousarray(table.reshape(len(columns), n * height * width).T)
+    return table
 
 
-def _shown(kind: int, planes: Ints, after: Ints | None) -> Ints:
+def values_at(columns: Ints, planes: Factors, actions: Ints, rows: Ints, y: Ints, x: Ints) -> Bools:
+    """As ``column_values``, of some positions of some transitions only, bool [K, D].
+
+    Args:
+        columns: relative columns of this state, int64 [D, 7].
+        planes: int [N, C, H, W].
+        actions: int64 [N].
+        rows: transition of each, int64 [K].
+        y: row of its position, int64 [K].
+        x: column of its position, int64 [K].
+    """
+    table = np.zeros((len(rows), len(columns)), dtype=np.bool_)
+    order = np.argsort(rows, kind="stable")
+    for begin in range(0, len(rows), PIECE):
+        some = order[begin : begin + PIECE]
+        met, where = np.unique(rows[some], return_inverse=True)
+        wide, part = planes[met].astype(np.int64), np.zeros((len(some), len(columns)), dtype=np.bool_)
+        _look_around(columns, wide, where, y[some], x[some], part)
+        for d in np.flatnonzero(np.isin(columns[:, 0], (ACTION, MEETING))):
+            part[:, d] = far_value(columns[d], wide, actions[met], None)[where]
+        table[some] = part
+    return table
+
+
+@compiled
+def _look_around(columns: Ints, planes: Ints, rows: Ints, y: Ints, x: Ints, out: Bools) -> None:
+    """The part of ``values_at`` that differs from position to position."""
+    _, _, height, width = planes.shape
+    for k in range(len(rows)):
+        for d in range(len(columns)):
+            kind = columns[d, 0]
+            if kind == BORDER:
+                row, column = y[k] + columns[d, 1], x[k] + columns[d, 2]
+                out[k, d] = not (0 <= row < height and 0 <= column < width)
+            elif kind in (CELL, WRAP):
+                row, column = y[k] + columns[d, 3], x[k] + columns[d, 4]
+                inside = 0 <= row < height and 0 <= column < width
+                if inside and kind == CELL:
+                    out[k, d] = planes[rows[k], columns[d, 1], row, column] == columns[d, 2]
+                elif not inside and kind == WRAP:
+                    out[k, d] = planes[rows[k], columns[d, 1], row % height, column % width] == columns[d, 2]
+
+
+def _shown(kind: int, planes: Factors, after: Factors | None) -> Factors:
     if kind not in (NEXT, NEXT_MEETING):
         return planes
     assert after is not None
     return after
 
 
-def far_value(column: Ints, planes: Ints, actions: Ints, after: Ints | None) -> Bools:
+def far_value(column: Ints, planes: Factors, actions: Ints, after: Factors | None) -> Bools:
     """As ``column_values``, for a column that is the same at all positions, bool [N]."""
     kind = int(column[0])
     return actions == column[1] if kind == ACTION else meets(_shown(kind, planes, after), column[1:])
@@ -173,7 +257,7 @@ def wrapped(plane: NDArray[_T], below: int, right: int) -> NDArray[_T]:
     return np.where(inside, np.zeros_like(around), around)
 
 
-def meets(planes: Ints, meeting: Ints) -> Bools:
+def meets(planes: Factors, meeting: Ints) -> Bools:
     """Whether, anywhere, one channel has a value and the other has its value so far from there, bool [N]."""
     first, value, second, other, below, right = (int(part) for part in meeting)
     inside = np.ones((1, *planes.shape[2:]), dtype=np.bool_)

@@ -101,3 +101,21 @@ def test_a_graph_that_was_cleared_is_as_new() -> None:
         assert graph.expanded.sum() == 20
     assert sizes == (len(graph), graph.n_edges)
     assert graph.find(states[:1])[0] == 0
+
+
+def test_many_states_that_are_equally_likely_are_expanded_together() -> None:
+    # One step draws five wheels and sets a sixth, which stay from then on: 96 states that are alike, more than there is room for
+    # at first.
+    rng = np.random.default_rng(0)
+    states, actions = rng.integers(3, size=(4000, 7)), rng.integers(3, size=4000)
+    states[:, 6] = rng.integers(2, size=4000)
+    following = np.where(states[:, 6:] == 1, states, rng.integers(3, size=(4000, 7)))
+    following[:, 5] = np.where(states[:, 6] == 1, states[:, 5], actions)
+    following[:, 6] = 1
+    model = DecisionGraphModel((*(3,) * 6, 2), 3)
+    model.fit(dataset(model.cardinalities, 3, states, actions, following))
+    graph = StateGraph(model)
+    roots = graph.add(states[states[:, 6] == 0][:1], np.zeros(1, dtype=np.int64))
+    grow_lookahead(graph, roots, 300, 200, horizon=5, seed=0)
+    assert graph.expanded.all()
+    assert 80 < graph.expanded.sum() <= 97

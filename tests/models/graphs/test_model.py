@@ -99,7 +99,7 @@ def test_a_maze_of_flat_bits_in_any_order_is_learned_in_5000_steps() -> None:
     def mixed(n: int, seed: int) -> TransitionDataset:
         rows = played(Maneuverer(), n, 100, seed).rows()
         data = TransitionDataset((2,) * 108, 4)
-        data.append(replace(rows, states=rows.states[:, order], next_states=rows.next_states[:, order]))
+        data.append(replace(rows, before=rows.before[:, order], after=rows.after[:, order]))
         return data
 
     flat = DecisionGraphModel((2,) * 108, 4)

@@ -1,0 +1,245 @@
+"""Tree search on a machine that is known with its rewards: many short simulations in one compiled call.
+
+Trial-based heuristic tree search (Keller and Helmert 2013) with transpositions: actions by upper confidence bounds (Auer et al.
+2002), successors by chance, Bellman backups with the machine's own probabilities on the way back. A simulation ends at a state
+that none has met before, at the end of the episode, or after ``depth`` steps. Every root is searched from nothing.
+Shapes: S states, A actions, K successors, M edges, R roots.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent_envs._compiled import borrowed, compiled, inlined
+from mbagent_envs.random_keys import derive_one, mix
+
+Ints: TypeAlias = NDArray[np.int64]
+Floats: TypeAlias = NDArray[np.float64]
+Bools: TypeAlias = NDArray[np.bool_]
+
+DEPTH = 3
+"""Steps of a simulation, at most, where nothing else is said."""
+
+MOST_COUNTED = 1 << 14
+"""Visits beyond this count as so many in the bounds."""
+
+_STEP = np.uint64(0x9E3779B97F4A7C15)
+_UNIT = 2.0**-53
+
+
+class KnownMachine(NamedTuple):
+    """A machine in the form that the search reads.
+
+    Attributes:
+        first: where the edges of each (state, action) begin, int64 [S * A + 1].
+        following: state that each edge leads to, int64 [M].
+        below: probability of the edges up to and with this one, of the same pair, [M].
+        weight: probability times discount, 0 where the episode ends, [M].
+        income: expected reward of each (state, action), [S, A].
+        first_value: what a state is worth that was not met yet, [S].
+        over: whether an edge ends the episode, bool [M].
+    """
+
+    first: Ints
+    following: Ints
+    below: Floats
+    weight: Floats
+    income: Floats
+    first_value: Floats
+    over: Bools
+
+
+class Searched(NamedTuple):
+    """What was found at the roots.
+
+    Attributes:
+        values: of each action, [R, A].
+        visits: simulations through each action, int64 [R, A].
+        steps: successors drawn in all.
+    """
+
+    values: Floats
+    visits: Ints
+    steps: int
+
+
+def known_machine(
+    first: Ints,
+    following: Ints,
+    probabilities: Floats,
+    rewards: Floats,
+    over: Bools,
+    first_value: Floats,
+    n_actions: int,
+    gamma: float,
+) -> KnownMachine:
+    """Prepares a machine, once for a goal.
+
+    Args:
+        first: where the edges of each (state, action) begin, int64 [S * A + 1].
+        following: int64 [M].
+        probabilities: [M], summing to one over each pair.
+        rewards: [M].
+        over: whether an edge ends the episode, bool [M].
+        first_value: what states are worth that the search has not met yet, [S].
+        n_actions: number of actions A.
+        gamma: discount of a step.
+    """
+    pair = np.repeat(np.arange(len(first) - 1), np.diff(first))
+    total = np.cumsum(probabilities)
+    before = np.concatenate([[0.0], total])[first[:-1]]
+    income: Floats = np.bincount(pair, weights=probabilities * rewards, minlength=len(first) - 1).astype(np.float64)
+    weight = np.where(over, 0.0, gamma * probabilities)
+    return KnownMachine(first, following, total - before[pair], weight, income.reshape(-1, n_actions), first_value, over)
+
+
+_N = np.arange(MOST_COUNTED, dtype=np.float64)
+BOUND_TOP, BOUND_BELOW = np.sqrt(np.log(_N + 1.0)), 1.0 / np.sqrt(np.maximum(_N, 0.5))
+"""Parts of the upper confidence bound, by total visits and by an action's."""
+
+
+def search_machine(
+    machine: KnownMachine, roots: Ints, n_simulations: int, seed: int, *, depth: int = DEPTH, c_uct: float = 0.5
+) -> Searched:
+    """Searches from every root, int64 [R]; what is found at one depends neither on the others nor on their number.
+
+    Args:
+        machine: the world and the goal.
+        roots: where to search from.
+        n_simulations: for each root.
+        seed: which random numbers.
+        depth: steps of a simulation, at most.
+        c_uct: weight of exploration, in units of the range of the values of the root's actions.
+    """
+    n_actions = machine.income.shape[1]
+    values, visits = np.empty((len(roots), n_actions)), np.zeros((len(roots), n_actions), dtype=np.int64)
+    steps = _search_all(machine, roots, n_simulations, np.uint64(seed), depth, c_uct, BOUND_TOP, BOUND_BELOW, values, visits)
+    return Searched(values, visits, steps)
+
+
+@compiled
+def _search_all(
+    machine: KnownMachine,
+    roots: Ints,
+    n_simulations: int,
+    seed: np.uint64,
+    depth: int,
+    c_uct: float,
+    top: Floats,
+    below: Floats,
+    values: Floats,
+    visits: Ints,
+) -> int:
+    n_states, n_actions = machine.income.shape
+    owned = (
+        np.empty((n_states, n_actions)),
+        np.empty(n_states),
+        np.empty((n_states, n_actions), dtype=np.int64),
+        np.empty(n_states, dtype=np.int64),
+    )
+    q, v, n, met = borrowed(owned)
+    path, steps, m = np.empty(depth, dtype=np.int64), 0, borrowed(machine)
+    for r in range(len(roots)):
+        root, state = roots[r], derive_one(seed, np.uint64(roots[r]))
+        met[:] = 0
+        v[:] = m.first_value
+        _meet(root, m, q, v, n, met)
+        for _ in range(n_simulations):
+            state, taken = _simulate(root, state, depth, c_uct, m, top, below, q, v, n, met, path)
+            visits[r, path[0] - root * n_actions] += 1
+            steps += taken
+        for a in range(n_actions):
+            values[r, a] = _worth(root, a, m.first, m.following, m.weight, m.income, v)
+    return steps + 0 * len(owned[1])  # what is lent must live until here
+
+
+@inlined
+def _worth(s: int, a: int, first: Ints, following: Ints, weight: Floats, income: Floats, v: Floats) -> float:
+    """Value of an action by those of its successors."""
+    total = income[s, a]
+    pair = s * income.shape[1] + a
+    for e in range(first[pair], first[pair + 1]):
+        total += weight[e] * v[following[e]]
+    return float(total)
+
+
+@inlined
+def _meet(s: int, m: KnownMachine, q: Floats, v: Floats, n: Ints, met: Ints) -> None:
+    """Values a state that no simulation has met before by its successors' first values."""
+    best = -np.inf
+    for a in range(q.shape[1]):
+        q[s, a] = _worth(s, a, m.first, m.following, m.weight, m.income, v)
+        n[s, a] = 0
+        best = max(best, q[s, a])
+    v[s] = best
+    met[s] = 1
+
+
+@inlined
+def _best_bound(s: int, scale: float, below: Floats, q: Floats, n: Ints) -> int:
+    """The action with the greatest upper confidence bound."""
+    best, chosen = -np.inf, 0
+    for a in range(q.shape[1]):
+        score = q[s, a] + scale * below[min(n[s, a], MOST_COUNTED - 1)]
+        if score > best:
+            best, chosen = score, a
+    return chosen
+
+
+@inlined
+def _back_up(path: Ints, length: int, first: Ints, following: Ints, weight: Floats, income: Floats, q: Floats, v: Floats) -> None:
+    """Bellman backups of the (state, action) pairs of a simulation, the last one first."""
+    for i in range(length - 1, -1, -1):
+        s = path[i] // q.shape[1]
+        a = path[i] - s * q.shape[1]
+        q[s, a] = _worth(s, a, first, following, weight, income, v)
+        best = q[s, 0]
+        for b in range(1, q.shape[1]):
+            best = max(best, q[s, b])
+        v[s] = best
+
+
+@inlined
+def _simulate(
+    root: int,
+    state: np.uint64,
+    depth: int,
+    c_uct: float,
+    m: KnownMachine,
+    top: Floats,
+    below: Floats,
+    q: Floats,
+    v: Floats,
+    n: Ints,
+    met: Ints,
+    path: Ints,
+) -> tuple[np.uint64, int]:
+    """One simulation; returns the state of the random numbers after it, and how many successors it has drawn."""
+    first, following, weight, income, n_actions = m.first, m.following, m.weight, m.income, q.shape[1]
+    low, high = q[root, 0], q[root, 0]
+    for a in range(1, n_actions):
+        low, high = min(low, q[root, a]), max(high, q[root, a])
+    spread, s, length = c_uct * (high - low), root, 0
+    while length < depth:
+        chosen = _best_bound(s, spread * top[min(met[s], MOST_COUNTED - 1)], below, q, n)
+        n[s, chosen] += 1
+        met[s] += 1
+        pair = s * n_actions + chosen
+        path[length] = pair
+        length += 1
+        state += _STEP
+        luck, e = float(mix(state) >> np.uint64(11)) * _UNIT, first[pair]
+        last = first[pair + 1] - 1
+        while e < last and luck >= m.below[e]:
+            e += 1
+        if m.over[e]:
+            break
+        s = following[e]
+        if met[s] == 0:
+            _meet(s, m, q, v, n, met)
+            break
+    _back_up(path, length, first, following, weight, income, q, v)
+    return state, length
