@@ -208,6 +208,8 @@ class ModelLearningAgent(SavableAlgorithm):
 
         Raises:
             TypeError, ValueError: the function does not return one finite number a transition; the old goal stays.
+            RuntimeError: it raised an error, the cause of this one; the old goal stays. (``predict`` raises this, too, where it
+                fails for transitions that are only imagined; the next goal is planned for as if nothing had been.)
         """
         self.policy.set_goal(self.goals.choose(reward))
 
