@@ -126,8 +126,7 @@ class ModelLearningAgent(SavableAlgorithm):
         )
         if not issubclass(self.policy_class, PlannerPolicy):
             raise TypeError(f"policy must be a planner policy such as 'MctsPolicy', got {self.policy_class.__name__}.")
-        self.model_name = check_model(model)
-        self.exploration_name = check_exploration(exploration)
+        self.model_name, self.exploration_name = check_model(model), check_exploration(exploration)
         self.gamma, self.num_simulations, self.time_budget, self.horizon = gamma, num_simulations, time_budget, horizon
         self.fit_report: FitReport | None = None
         self._custom_reward = reward
