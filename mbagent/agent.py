@@ -126,8 +126,7 @@ class ModelLearningAgent(SavableAlgorithm):
         )
         if not issubclass(self.policy_class, PlannerPolicy):
             raise TypeError(f"policy must be a planner policy such as 'MctsPolicy', got {self.policy_class.__name__}.")
-        self.model_name = check_model(model)
-        self.exploration_name = check_exploration(exploration)
+        self.model_name, self.exploration_name = check_model(model), check_exploration(exploration)
         self.gamma, self.num_simulations, self.time_budget, self.horizon = gamma, num_simulations, time_budget, horizon
         self._custom_reward, self.fit_report = reward, cast("FitReport | None", None)
         self._planning_seed = seed if seed is not None else int(np.random.SeedSequence().generate_state(1)[0] >> 1)
@@ -207,6 +206,8 @@ class ModelLearningAgent(SavableAlgorithm):
 
         Raises:
             TypeError, ValueError: the function does not return one finite number a transition; the old goal stays.
+            RuntimeError: it raised an error, the cause of this one; the old goal stays. (``predict`` raises this, too, where it
+                fails for transitions that are only imagined; the next goal is planned for as if nothing had been.)
         """
         self.policy.set_goal(self.goals.choose(reward))
 

@@ -75,7 +75,7 @@ class GoalBook:
         """Changes the goal; ``None`` goes back to the environment's own.
 
         Raises:
-            TypeError, ValueError: the function is no reward function; nothing is changed then.
+            TypeError, ValueError, RuntimeError: the function is no reward function, or fails; nothing is changed then.
         """
         custom = None
         if reward is not None:
@@ -141,7 +141,8 @@ class GoalBook:
         try:
             rewards = self._environment(rows.states, rows.actions, rows.next_states)
         except Exception as error:
-            return f"The environment's reward_fn does not take its observations ({type(error).__name__}: {error})"
+            cause = error.__cause__ or error
+            return f"The environment's reward_fn does not take its observations ({type(cause).__name__}: {cause})"
         wrong = ~np.isclose(rewards, rows.rewards, rtol=1e-4, atol=1e-6)
         if wrong.any():
             return f"The environment's reward_fn differs from {int(wrong.sum())} of the {len(rows)} rewards met"

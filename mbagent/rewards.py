@@ -51,6 +51,7 @@ class GivenReward:
     Raises (when called):
         TypeError: ``fn`` does not take three arguments, or does not return numbers.
         ValueError: it returned a wrong shape, NaN or infinity.
+        RuntimeError: it raised an error, which is the cause (``__cause__``) of this one.
     """
 
     def __init__(self, fn: RewardFn, space: FactoredSpace, actions: ActionEnumeration) -> None:
@@ -69,7 +70,14 @@ class GivenReward:
             self._actions.decode_wide(actions),
             self._space.decode_wide(next_states),
         )
-        result = self.fn(*batch)
+        try:
+            result = self.fn(*batch)
+        except Exception as error:
+            name = getattr(self.fn, "__qualname__", repr(self.fn))
+            raise RuntimeError(
+                f"The reward function {name} raised {type(error).__name__} ({error}) when it was given {len(actions)} "
+                "transitions, met or imagined; mend it or give another goal with set_reward(fn)."
+            ) from error
         if result is None:
             raise TypeError("The reward function returned None; it must return an array of numbers: is a return missing?")
         try:

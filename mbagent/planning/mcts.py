@@ -125,7 +125,7 @@ class _Search:
         rollouts = settings.leaf_values == "rollouts"
         prior = 0.0 if rollouts else settings.prior_visits
         # What is carried on must not meet the very luck that it was made of.
-        key = derive(settings.seed, _SEARCH_SALT, _CARRIED_SALT, decision)[0] if decision else _key(settings.seed, 0)
+        key = derive(settings.seed, _CARRIED_SALT, decision)[0] if decision else _key(settings.seed, 0)
         self.rules = Rules(settings.gamma, settings.c_uct, prior, rollouts, settings.backup == "mean", key)
         if not (rollouts and decision):
             measure_spans(graph.arrays, roots, self.tables)
@@ -204,13 +204,6 @@ class _Search:
         return values
 
 
-@lru_cache(maxsize=4096)
-def _key(seed: int, wave: int) -> np.uint64:
-    """Key of the search's luck (0), and of what the wave after ``wave - 1`` simulations imagines."""
-    key: np.uint64 = (derive(seed, _SEARCH_SALT) if wave == 0 else derive(seed, _SEARCH_SALT, wave))[0]
-    return key
-
-
 def _first_tables(solution: Values, roots: Ints) -> Tables:
     """Tables before the first simulation."""
     q, spread = solution.q, solution.v[roots]
@@ -218,6 +211,13 @@ def _first_tables(solution: Values, roots: Ints) -> Tables:
         solution.v, q, np.zeros_like(q), np.zeros_like(q), solution.rewards, solution.frontier,
         np.zeros((len(roots), q.shape[1])), np.ones(len(roots)), np.stack([spread, spread], axis=1),
     )  # fmt: skip
+
+
+@lru_cache(maxsize=4096)
+def _key(seed: int, wave: int) -> np.uint64:
+    """Key of the search's luck (0), and of what the wave after ``wave - 1`` simulations imagines."""
+    key: np.uint64 = (derive(seed, _SEARCH_SALT) if wave == 0 else derive(seed, _SEARCH_SALT, wave))[0]
+    return key
 
 
 def _longer(table: NDArray[np.float64], size: int) -> Floats:
