@@ -39,8 +39,8 @@ class PlannerSettings:
         reuse_tree: whether a decision begins with what the last one imagined (MctsPolicy, one observation at a time). Dropped at
             episode starts (``predict(..., episode_start=...)`` tells), with a new goal or new weights, where it holds more than
             MAX_KEPT states, or too few of what can follow. Outcomes then depend on the decisions before. It hardly helps: in
-            two learned games returns stayed as they were (30 episodes); a decision of 64 simulations took 28% and 13% less time,
-            one of 256 took 12% and 7% more, as kept graphs are larger.
+            two learned games returns stayed as they were (30 episodes); a decision of 64 simulations took 32% and 18% less time,
+            one of 256 took 20% and 7% more, as kept graphs are larger.
         seed: which random numbers.
 
     Raises:
