@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mbagent.analysis.folders import replaced, set_aside
-from mbagent.analysis.planning_benchmark.latency import SETTINGS
+from mbagent.analysis.planning_benchmark.latency import SETTINGS, steady
 from mbagent.analysis.planning_benchmark.latency import measure as measure_latency
 from mbagent.analysis.planning_benchmark.networks import build_task, run_networks_in_mctx
 from mbagent.analysis.planning_benchmark.noise import Sampler, trained
@@ -39,7 +39,7 @@ from mbagent.analysis.planning_benchmark.sampling import compare_short_cut, comp
 
 Rows = list[dict[str, Any]]
 Say = Callable[[str], None]
-PARTS = ("quality", "decisions", "regret", "naive", "short cut", "networks")
+PARTS = ("quality", "decisions", "memory", "regret", "naive", "short cut", "networks")
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Args:
     """Measure planning and sampling."""
 
     parts: tuple[str, ...] = PARTS
-    """What to measure: quality of play, what decisions cost, regret (with the speed of searches), naive, short cut, networks."""
+    """What to measure: quality of play, what decisions cost, memory, regret (with the speed of searches), naive, short cut, networks."""
     full: bool = False
     """5 agents of each kind, learned ones too, instead of 1 with the true model."""
     peers_python: Path | None = None
@@ -87,6 +87,15 @@ def measure_decisions(args: Args, say: Say) -> dict[str, Rows]:
         say(f"decisions: {setting.key}")
         rows += measure_latency(setting, args.first_seed + 1000, found[setting.key], 50 if args.full else 10)
     return {"decisions": rows}
+
+
+def measure_memory(args: Args, say: Say) -> dict[str, Rows]:
+    """Memory over many decisions."""
+    rows = []
+    for setting in SETTINGS[2:]:
+        say(f"memory: {setting.key}")
+        rows.append(steady(setting, args.first_seed + 1000, 100_000 if args.full else 10_000))
+    return {"memory": rows}
 
 
 def measure_regret(args: Args, say: Say) -> dict[str, Rows]:
@@ -133,6 +142,7 @@ def measure_networks(args: Args, say: Say) -> dict[str, Rows]:
 _MEASURES: dict[str, Callable[[Args, Say], dict[str, Rows]]] = {
     "quality": measure_quality,
     "decisions": measure_decisions,
+    "memory": measure_memory,
     "regret": measure_regret,
     "naive": measure_naive,
     "short cut": measure_short_cut,

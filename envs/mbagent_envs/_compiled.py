@@ -1,12 +1,15 @@
 """Numba's decorator with types: compiled on first use, kept on disk, and free of the interpreter lock.
 
-Numba renews what it keeps when the file of a function changes, not when a compiled function that it calls
-from another file does: after a change in `mbagent_envs.random_keys` delete ``envs/mbagent_envs/__pycache__``.
+Numba renews what it keeps when the file of a function changes, but not when a compiled function that it calls from another file
+does. Here everything that was kept is renewed when any file with compiled functions of the same package, or of this one, changes.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
@@ -19,7 +22,32 @@ _T = TypeVar("_T")
 
 def compiled(function: _F) -> _F:
     """Compile a function of numbers and arrays; its uncompiled form stays at ``function.py_func``."""
-    return cast("_F", numba.njit(cache=True, nogil=True)(function))
+    dispatcher = numba.njit(cache=True, nogil=True)(function)
+    kept = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    if kept is not None and hasattr(
+        kept, "_version"
+    ):  # what numba reads first of a file; one with another version counts as empty
+        kept._version = f"{kept._version} {_sources(_top(Path(function.__code__.co_filename)))}"
+    return cast("_F", dispatcher)
+
+
+@cache
+def _top(path: Path) -> Path:
+    """Folder of the outermost package that a file is in, or of the file."""
+    folder = path.parent
+    while (folder.parent / "__init__.py").exists():
+        folder = folder.parent
+    return folder
+
+
+@cache
+def _sources(folder: Path) -> str:
+    """A hash of all files with compiled functions in a folder, and in this one."""
+    digest, files = hashlib.sha256(), {*folder.rglob("*.py"), *Path(__file__).parent.glob("*.py")}
+    for text in (path.read_bytes() for path in sorted(files)):
+        if b"_compiled import" in text or b"numba" in text:
+            digest.update(text)
+    return digest.hexdigest()[:16]
 
 
 def inlined(function: _F) -> _F:

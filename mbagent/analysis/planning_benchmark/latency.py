@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -82,6 +83,36 @@ def measure(setting: Setting, seed: int, scale: Scale, episodes: int) -> list[Ro
              "times PPO": ours / theirs, "once for a goal, ms": 1e3 * once, "normalised": score}
         )  # fmt: skip
     return rows
+
+
+def steady(setting: Setting, seed: int, decisions: int) -> Row:
+    """Memory of this process before and after many decisions, MiB (peak so far), and time of the first and last tenth of them."""
+    case = find_case(setting.key)
+    env = case.make_env()
+    agent = ModelLearningAgent(
+        "MctsPolicy", env, seed=seed, num_simulations=setting.num_simulations, policy_kwargs=dict(setting.settings)
+    ).learn(2000, log_interval=None)
+    observations, tenth, seconds = distinct_observations(case.make_env(), OBSERVATIONS, seed), decisions // 10, []
+    for part in range(10):
+        if part == 1:
+            before = peak_mebibytes()
+        began = time.process_time()
+        for i in range(tenth):
+            agent.predict(observations[i % len(observations)])
+        seconds.append(time.process_time() - began)
+    return {
+        "game": setting.key,
+        "decisions": 10 * tenth,
+        "MiB after a tenth": before,
+        "MiB in the end": peak_mebibytes(),
+        "ms, first tenth": 1e3 * seconds[0] / tenth,
+        "ms, last tenth": 1e3 * seconds[-1] / tenth,
+    }
+
+
+def peak_mebibytes() -> float:
+    """The most memory that this process has held so far, MiB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def distinct_observations(env: Any, n: int, seed: int) -> list[Any]:
