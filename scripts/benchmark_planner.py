@@ -47,7 +47,7 @@ class Args:
     """Measure planning and sampling."""
 
     parts: tuple[str, ...] = PARTS
-    """What to measure: quality of play, what decisions cost, memory, regret (with the speed of searches), naive, short cut, networks."""
+    """What to measure: quality of play, cost of decisions, memory, regret (and speed of searches), naive, short cut, networks."""
     full: bool = False
     """5 agents of each kind, learned ones too, instead of 1 with the true model."""
     peers_python: Path | None = None
