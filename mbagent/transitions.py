@@ -118,27 +118,41 @@ class TransitionDataset:
         Raises:
             ValueError: states of another width, or values or actions out of range.
         """
-        if batch.before.shape != (len(batch), len(self.cardinalities)) or batch.after.shape != batch.before.shape:
-            raise ValueError(
-                f"These transitions have states of shape {batch.before.shape} and next states of shape "
-                f"{batch.after.shape}, but this dataset holds {len(self.cardinalities)} factors; "
-                "they come from another environment."
-            )
-        if len(batch) and not (batch.actions.min() >= 0 and batch.actions.max() < self.n_actions):
-            raise ValueError(
-                f"These transitions have actions outside 0 ... {self.n_actions - 1}; they come from another environment."
-            )
-        for values in (batch.before, batch.after):
-            if values.size and not (values.min() >= 0 and values.max() <= np.iinfo(self.kind).max):
-                raise ValueError(
-                    f"These transitions have values outside 0 ... {max(self.cardinalities) - 1}; they come from elsewhere."
-                )
+        self._check(batch)
         narrow = batch.narrowed(self.kind)
         if self.folder is None:
             self._chunks.append(narrow)
         elif len(batch):
-            _write(Path(self.folder), narrow, len(self))
+            folder, n_factors = Path(self.folder), len(self.cardinalities)
+            if len(_mapped(folder, n_factors, self.kind)) != len(self):
+                raise ValueError(f"Another dataset has written to {folder} since this one read it; load it anew.")
+            _write(folder, narrow, len(self))
             self._chunks = [_mapped(Path(self.folder), len(self.cardinalities), self.kind)]
+
+    def _check(self, batch: TransitionBatch) -> None:
+        """Refuses rows that are not of this dataset's kind."""
+        n, n_factors = len(batch), len(self.cardinalities)
+        if batch.before.shape != (n, n_factors) or batch.after.shape != batch.before.shape:
+            raise ValueError(
+                f"These transitions have states of shape {batch.before.shape} and next states of shape "
+                f"{batch.after.shape}, but this dataset holds {n_factors} factors; they come from another environment."
+            )
+        if any(len(getattr(batch, name)) != n for name in _KEPT) or {batch.before.dtype.kind, batch.after.dtype.kind} - set(
+            "iub"
+        ):
+            raise ValueError("Transitions need columns of one length, and states that are whole numbers.")
+        if n and not (batch.actions.min() >= 0 and batch.actions.max() < self.n_actions):
+            raise ValueError(
+                f"These transitions have actions outside 0 ... {self.n_actions - 1}; they come from another environment."
+            )
+        for values in (batch.before, batch.after) if n else ():
+            wrong = (values.min(axis=0) < 0) | (values.max(axis=0) >= np.asarray(self.cardinalities))
+            if wrong.any():
+                factor = int(wrong.argmax())
+                raise ValueError(
+                    f"These transitions have values of factor {factor} outside 0 ... {self.cardinalities[factor] - 1}; they come "
+                    "from another environment."
+                )
 
     def take(self, other: TransitionDataset) -> None:
         """Appends all rows of another dataset, as further episodes.
@@ -259,6 +273,10 @@ def _about(folder: Path) -> dict[str, Any]:
 def _begun(folder: Path, cardinalities: tuple[int, ...], n_actions: int, kind: np.dtype[Any]) -> TransitionBatch:
     """A folder's rows; makes the folder where there is none."""
     about = {"cardinalities": list(cardinalities), "n_actions": n_actions}
+    if folder.is_file() or not cardinalities:
+        raise ValueError(
+            f"{folder} cannot hold transitions of {len(cardinalities)} factors; give a folder, and a factor at least."
+        )
     if not (folder / "dataset.json").exists():
         folder.mkdir(parents=True, exist_ok=True)
         for name in _COLUMNS:
@@ -279,6 +297,9 @@ def _mapped(folder: Path, n_factors: int, kind: np.dtype[Any]) -> TransitionBatc
     """The rows that all files have; one that was cut short counts for nothing."""
     types, columns = _types(kind), []
     width = {name: n_factors if name in ("states", "next_states") else 1 for name in _COLUMNS}
+    missing = [name for name in _COLUMNS if not (folder / f"{name}.bin").exists()]
+    if missing:
+        raise ValueError(f"{folder} is no folder of transitions: it lacks {missing[0]}.bin.")
     n = min((folder / f"{name}.bin").stat().st_size // max(1, width[name] * types[name].itemsize) for name in _COLUMNS)
     for name in _COLUMNS:
         shape = (n, n_factors) if name in ("states", "next_states") else (n,)

@@ -1,5 +1,6 @@
 """Rows in memory and in files: narrow, whole, and refused where they are of another world."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +36,7 @@ def test_bits_are_kept_as_bytes_and_read_as_wide_integers() -> None:
 
 def test_values_that_no_factor_has_are_refused() -> None:
     data = TransitionDataset((2, 2), 4)
-    for value in (-1, 256):
+    for value in (-1, 2, 256):
         wrong, none = np.full((1, 2), value), np.zeros(1, np.int64)
         with pytest.raises(ValueError, match="outside 0"):
             data.append(TransitionBatch(wrong, none, wrong, none == 1, np.zeros(1), none))
@@ -97,3 +98,37 @@ def test_files_are_read_back(tmp_path: Path) -> None:
     data.append(batch(30))
     data.save(tmp_path / "rows.npz")
     assert same(TransitionDataset.load(tmp_path / "rows.npz").rows(), batch(30))
+
+
+def test_values_are_checked_factor_by_factor_and_columns_by_their_length() -> None:
+    data, good = TransitionDataset(CARDINALITIES, 4), batch(3)
+    wrong = good.states.copy()
+    wrong[1, 1] = 3
+    with pytest.raises(ValueError, match="factor 1 outside"):
+        data.append(TransitionBatch(wrong, good.actions, good.states, good.terminated, good.rewards, good.episodes))
+    with pytest.raises(ValueError, match="of one length"):
+        data.append(TransitionBatch(good.states, good.actions, good.states, good.terminated, good.rewards[:1], good.episodes))
+    with pytest.raises(ValueError, match="whole numbers"):
+        data.append(replace(good, before=good.states + 0.5))  # type: ignore[arg-type]
+    assert len(data) == 0
+
+
+def test_two_datasets_do_not_write_over_each_other(tmp_path: Path) -> None:
+    one, other = (TransitionDataset(CARDINALITIES, 4, folder=tmp_path / "rows") for _ in range(2))
+    one.append(batch(20))
+    seen = one.rows().states.copy()
+    with pytest.raises(ValueError, match="load it anew"):
+        other.append(batch(2, 1))
+    one.append(batch(2, 1))
+    assert np.array_equal(one.rows().states[:20], seen)
+    assert len(TransitionDataset.load(tmp_path / "rows")) == 22
+
+
+def test_a_file_or_half_a_folder_is_no_folder_of_transitions(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="cannot hold"):
+        TransitionDataset(CARDINALITIES, 4, folder=tmp_path / "file")
+    TransitionDataset(CARDINALITIES, 4, folder=tmp_path / "rows").append(batch(3))
+    (tmp_path / "rows" / "rewards.bin").unlink()
+    with pytest.raises(ValueError, match=r"lacks rewards\.bin"):
+        TransitionDataset.load(tmp_path / "rows")

@@ -124,8 +124,15 @@ def toy_text_model(env: gym.Env[Any, Any]) -> tuple[TableModel, Callable[[Any, A
 
     Args:
         env: with ``unwrapped.P[state][action] -> [(probability, next state, reward, terminated)]``.
+
+    Raises:
+        TypeError: it has no such table.
     """
     unwrapped: Any = env.unwrapped
+    if not hasattr(unwrapped, "P") or not hasattr(unwrapped, "initial_state_distrib"):
+        raise TypeError(
+            f"{unwrapped} has no table of its rules (P and initial_state_distrib), as FrozenLake, CliffWalking and Taxi have."
+        )
     table, n_actions = unwrapped.P, int(unwrapped.action_space.n)
     n_states = len(table)
     offsets, rows = [0], []

@@ -112,9 +112,17 @@ def search_machine(
         n_simulations: for each root.
         seed: which random numbers.
         depth: steps of a simulation, at most.
-        c_uct: weight of exploration, in units of the range of the values of the root's actions.
+        c_uct: weight of exploration, in units of the range of the values of the root's actions, if they differ.
+
+    Raises:
+        ValueError: a root that is no state, a depth or a number of simulations below 1, or a negative seed.
     """
-    n_actions = machine.income.shape[1]
+    n_states, n_actions = machine.income.shape
+    if len(roots) and not (roots.min() >= 0 and roots.max() < n_states):
+        raise ValueError(f"Roots must be states, 0 ... {n_states - 1}, got {roots}.")
+    for name, value, least in (("n_simulations", n_simulations, 1), ("depth", depth, 1), ("seed", seed, 0)):
+        if value < least:
+            raise ValueError(f"{name} must be at least {least}, got {value}.")
     values, visits = np.empty((len(roots), n_actions)), np.zeros((len(roots), n_actions), dtype=np.int64)
     steps = _search_all(machine, roots, n_simulations, np.uint64(seed), depth, c_uct, BOUND_TOP, BOUND_BELOW, values, visits)
     return Searched(values, visits, steps)
@@ -222,7 +230,7 @@ def _simulate(
     low, high = q[root, 0], q[root, 0]
     for a in range(1, n_actions):
         low, high = min(low, q[root, a]), max(high, q[root, a])
-    spread, s, length = c_uct * (high - low), root, 0
+    spread, s, length = c_uct * (high - low if high > low else 1.0), root, 0
     while length < depth:
         chosen = _best_bound(s, spread * top[min(met[s], MOST_COUNTED - 1)], below, q, n)
         n[s, chosen] += 1

@@ -58,3 +58,21 @@ def test_a_root_does_not_depend_on_the_others() -> None:
         np.testing.assert_array_equal(alone.values[0], together.values[i])
         np.testing.assert_array_equal(alone.visits[0], together.visits[i])
     assert not np.array_equal(search_machine(machine, roots, 200, 10).visits, together.visits)
+
+
+def test_where_nothing_is_known_all_actions_are_tried() -> None:
+    # A corridor of 6 cells, a prize at its end, first values that say nothing.
+    table, rewards = np.zeros((6, 2, 6)), (np.arange(6) == 5).astype(np.float64)
+    for s in range(6):
+        table[s, 0, max(s - 1, 0)] = table[s, 1, min(s + 1, 5)] = 1.0
+    found = search_machine(machine_of(table, rewards, np.zeros(6)), np.array([0]), 3000, 0, depth=8)
+    assert found.visits.min() > 0
+    assert found.values[0, 1] > found.values[0, 0] > 0.0
+
+
+@pytest.mark.parametrize("wrong", [{"depth": 0}, {"n_simulations": 0}, {"seed": -1}, {"roots": np.array([9])}])
+def test_arguments_out_of_range_are_named(wrong: dict[str, object]) -> None:
+    table = random_table(4, 2, 0)
+    arguments = {"roots": np.array([0]), "n_simulations": 5, "seed": 0, **wrong}
+    with pytest.raises(ValueError, match="must be"):
+        search_machine(machine_of(table, np.zeros(4), np.zeros(4)), **arguments)  # type: ignore[arg-type]
