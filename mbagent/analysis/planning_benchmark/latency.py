@@ -6,6 +6,7 @@ import resource
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -86,7 +87,7 @@ def measure(setting: Setting, seed: int, scale: Scale, episodes: int) -> list[Ro
 
 
 def steady(setting: Setting, seed: int, decisions: int) -> Row:
-    """Memory of this process before and after many decisions, MiB (peak so far), and time of the first and last tenth of them."""
+    """Memory of this process after a tenth of many decisions and after all, MiB, and time of the first and last tenth of them."""
     case = find_case(setting.key)
     env = case.make_env()
     agent = ModelLearningAgent(
@@ -95,7 +96,7 @@ def steady(setting: Setting, seed: int, decisions: int) -> Row:
     observations, tenth, seconds = distinct_observations(case.make_env(), OBSERVATIONS, seed), decisions // 10, []
     for part in range(10):
         if part == 1:
-            before = peak_mebibytes()
+            before = mebibytes_held()
         began = time.process_time()
         for i in range(tenth):
             agent.predict(observations[i % len(observations)])
@@ -104,14 +105,17 @@ def steady(setting: Setting, seed: int, decisions: int) -> Row:
         "game": setting.key,
         "decisions": 10 * tenth,
         "MiB after a tenth": before,
-        "MiB in the end": peak_mebibytes(),
+        "MiB in the end": mebibytes_held(),
         "ms, first tenth": 1e3 * seconds[0] / tenth,
         "ms, last tenth": 1e3 * seconds[-1] / tenth,
     }
 
 
-def peak_mebibytes() -> float:
-    """The most memory that this process has held so far, MiB."""
+def mebibytes_held() -> float:
+    """Memory that this process holds, MiB; where the system does not tell, the most that it has held so far."""
+    statm = Path("/proc/self/statm")
+    if statm.exists():
+        return int(statm.read_text(encoding="ascii").split()[1]) * resource.getpagesize() / 2**20
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 

@@ -32,7 +32,7 @@ NOTES = {
     "episodes, with its bootstrap interval. Of tables the exact value of what the agent does.",
     "decisions": "Median processor time on one core about single observations, none met twice. The reward is the game's own, or "
     "the same as a plain Python function; what is done once for a goal (the reachable machine, if it is small) is timed apart.",
-    "memory": "The most memory that the process has held, after a tenth of the decisions and in the end.",
+    "memory": "Memory that the process holds after a tenth of the decisions and in the end.",
     "regret": "Random worlds of 25 states and 4 actions with exact values known; every search gets the same crude leaf values "
     "(exact value plus noise as large as the values' spread), but for searches by random play. 1 is what a random action loses, "
     "0 is perfect; error: standard error over worlds. At most 15 steps deep in mctx.",
