@@ -131,7 +131,7 @@ def toy_text_model(env: gym.Env[Any, Any]) -> tuple[TableModel, Callable[[Any, A
     unwrapped: Any = env.unwrapped
     if not hasattr(unwrapped, "P") or not hasattr(unwrapped, "initial_state_distrib"):
         raise TypeError(
-            f"{unwrapped} has no table of its rules (P and initial_state_distrib), as FrozenLake, CliffWalking and Taxi have."
+            f"{unwrapped} has no table of its rules: it lacks P or initial_state_distrib, as toy_text's tables have them."
         )
     table, n_actions = unwrapped.P, int(unwrapped.action_space.n)
     n_states = len(table)
