@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.base import (
     Actions,
-    BaseTransitionModel,
     Bools,
-    FitReport,
     Floats,
     Randomness,
     States,
     Successors,
     as_keys,
 )
+from mbagent.models.known import KnownModel
 from mbagent.models.thinning import thin
 from mbagent.spaces import FactoredSpace
-from mbagent.transitions import TransitionDataset
 from mbagent_envs import Game
 from mbagent_envs.random_keys import derive
 
 
-class SimulatorModel(BaseTransitionModel):
+class SimulatorModel(KnownModel):
     """A game's true dynamics. There is nothing to learn: ``fit`` does nothing and ``state_dict`` is empty.
 
     Args:
@@ -42,12 +37,6 @@ class SimulatorModel(BaseTransitionModel):
         super().__init__(self.space.cardinalities, int(game.action_space.n))
         self._shape = game.observation_space.shape
         self.lists = type(game).transition_distributions is not Game.transition_distributions
-
-    def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
-        """Does nothing: the rules are known."""
-        if progress is not None:
-            progress(1.0)
-        return FitReport(n_train=len(data), n_validation=0, epochs=0, seconds=0.0)
 
     def start_states(self, n: int, seed: int = 0) -> States:
         """Start states int64 [n, F] of the game: an agent with this model can plan without having learned."""
@@ -103,16 +92,3 @@ class SimulatorModel(BaseTransitionModel):
         terminated = self.game.terminated(observations[rows], actions[rows], following)
         offsets = np.concatenate([[0], np.cumsum((probabilities > 0).sum(axis=1))]).astype(np.int64)
         return Successors(offsets, self._factors(following), terminated, probabilities[rows, which])
-
-    def state_dict(self) -> dict[str, NDArray[Any]]:
-        """Empty."""
-        return {}
-
-    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Takes the empty mapping.
-
-        Raises:
-            ValueError: there are weights in it.
-        """
-        if state:
-            raise ValueError(f"The true simulator has no weights, but was given {sorted(state)[0]!r} and perhaps more.")

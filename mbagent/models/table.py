@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
@@ -11,21 +11,19 @@ from numpy.typing import NDArray
 
 from mbagent.models.base import (
     Actions,
-    BaseTransitionModel,
     Bools,
-    FitReport,
     Floats,
     Randomness,
     States,
     Successors,
     as_keys,
 )
+from mbagent.models.known import KnownModel
 from mbagent.models.thinning import thin
-from mbagent.transitions import TransitionDataset
 from mbagent_envs.random_keys import uniforms
 
 
-class TableModel(BaseTransitionModel):
+class TableModel(KnownModel):
     """A world of one factor whose rules are known. There is nothing to learn: ``fit`` does nothing, ``state_dict`` is empty.
 
     Args:
@@ -60,12 +58,6 @@ class TableModel(BaseTransitionModel):
             raise ValueError(
                 "A table needs outcomes for every (state, action), with one next state, end and probability each, summing to one."
             )
-
-    def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
-        """Does nothing: the rules are known."""
-        if progress is not None:
-            progress(1.0)
-        return FitReport(n_train=len(data), n_validation=0, epochs=0, seconds=0.0)
 
     def start_states(self, n: int, seed: int = 0) -> States:
         """All start states, int64 [n or fewer, 1]."""
@@ -102,19 +94,6 @@ class TableModel(BaseTransitionModel):
         with np.errstate(divide="ignore"):
             result: Floats = np.log(np.bincount(found.rows[met], weights=found.probabilities[met], minlength=len(states)))
         return result
-
-    def state_dict(self) -> dict[str, NDArray[Any]]:
-        """Empty."""
-        return {}
-
-    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Takes the empty mapping.
-
-        Raises:
-            ValueError: there are weights in it.
-        """
-        if state:
-            raise ValueError(f"A known table has no weights, but was given {sorted(state)[0]!r} and perhaps more.")
 
 
 def toy_text_model(env: gym.Env[Any, Any]) -> tuple[TableModel, Callable[[Any, Any, Any], Floats]]:

@@ -6,14 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.state_graph import StateGraph
-from mbagent.planning.growing import grow_around
+from mbagent.planning.growing import ABOUT_AS_LIKELY, LAYER_WIDTH, grow_around
 from mbagent_envs.random_keys import derive
-
-LAYER_WIDTH = 32
-"""Draws for a (state, action) are chosen so that a layer's states times draws stay about this many."""
-
-ABOUT_AS_LIKELY = 0.5
-"""States at least this share as likely as the likeliest are expanded together."""
 
 
 def layer_seed(seed: int, depth: int) -> int:

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol, TypeAlias
+from collections.abc import Callable, Sequence
+from typing import Protocol, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mbagent.analysis.planning_benchmark.peers import Speed
-from mbagent.analysis.planning_benchmark.worlds import Bools, Floats, Ints, World
-from mbagent.models.base import BaseTransitionModel, FitReport, Randomness, Successors, as_keys
+from mbagent.analysis.planning_benchmark.worlds import Ints, World
+from mbagent.models.table import TableModel
 from mbagent.planning.machine_search import known_machine, search_machine
 from mbagent.planning.mcts import MctsPlanner
 from mbagent.planning.planner import PlannerSettings, best_actions
-from mbagent.transitions import TransitionDataset
-from mbagent_envs.random_keys import uniforms
 
 
 class TableSearch(Protocol):
@@ -32,48 +29,17 @@ Prepare: TypeAlias = Callable[[World], TableSearch]
 """What is done once for a world: the rules and the goal are given, and what a state is worth that was not looked beyond."""
 
 
-class TableWorldModel(BaseTransitionModel):
-    """A table as a TransitionModel of one factor; it has nothing to learn."""
-
-    def __init__(self, table: Floats, ends: Bools) -> None:
-        """Takes P(next state | state, action), float64 [S, A, S], and whether arrival terminates, bool [S]."""
-        super().__init__((table.shape[0],), table.shape[1])
-        self.table, self.ends, self._cumulated = table, ends, table.cumsum(axis=2)
-
-    def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
-        """Nothing to do."""
-        return FitReport(len(data), 0, 0, 0.0)
-
-    def sample(self, states: Ints, actions: Ints, rng: Randomness) -> tuple[Ints, Bools]:
-        """See TransitionModel."""
-        luck = uniforms(as_keys(rng, len(states)), 1)
-        chosen = (luck >= self._cumulated[states[:, 0], actions]).sum(axis=1)
-        following = np.minimum(chosen, len(self.table) - 1)
-        return following[:, None], self.ends[following]
-
-    def successors(self, states: Ints, actions: Ints, n_samples: int, seed: int) -> Successors:
-        """See TransitionModel; all of them."""
-        p = self.table[states[:, 0], actions]
-        rows, following = np.nonzero(p)
-        offsets = np.concatenate([[0], np.cumsum((p > 0).sum(axis=1))]).astype(np.int64)
-        return Successors(offsets, following[:, None], self.ends[following], p[rows, following])
-
-    def marginals(self, states: Ints, actions: Ints) -> Floats:
-        """See TransitionModel."""
-        row: Floats = self.table[states[:, 0], actions]
-        return row
-
-    def state_dict(self) -> dict[str, NDArray[Any]]:
-        """Nothing."""
-        return {}
-
-    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Nothing to do."""
+def as_model(world: World) -> TableModel:
+    """The world as a transition model of one factor."""
+    n_states, n_actions, n_successors = world.successors.shape
+    following, nowhere = np.ascontiguousarray(world.successors.reshape(-1)), np.zeros(0, dtype=np.int64)
+    offsets = np.arange(n_states * n_actions + 1) * n_successors
+    return TableModel(offsets, following, world.ends[following], world.probabilities.reshape(-1), n_actions, nowhere)
 
 
 def with_rollouts(world: World) -> TableSearch:
     """The agent's planner as textbook UCT. It values leaves by random play and cannot be given leaf values."""
-    model, none = TableWorldModel(world.table, world.ends), np.zeros((0, 1), dtype=np.int64)
+    model, none = as_model(world), np.zeros((0, 1), dtype=np.int64)
 
     def search(roots: Ints, n_simulations: int, seed: int) -> tuple[Ints, int]:
         settings = PlannerSettings(
@@ -89,16 +55,16 @@ def with_rollouts(world: World) -> TableSearch:
 
 def on_machine(world: World) -> TableSearch:
     """Tree search on the world as a known machine."""
-    n_states, n_actions, n_successors = world.successors.shape
-    following = np.ascontiguousarray(world.successors.reshape(-1))
+    model = as_model(world)
+    following, over = model.next_states, model.terminated
     machine = known_machine(
-        np.arange(n_states * n_actions + 1) * n_successors,
+        model.offsets,
         following,
-        world.probabilities.reshape(-1),
+        model.probabilities,
         world.rewards[following],
-        world.ends[following],
+        over,
         world.leaf_values,
-        n_actions,
+        model.n_actions,
         world.gamma,
     )
 

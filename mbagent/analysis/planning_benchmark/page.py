@@ -36,7 +36,9 @@ NOTES = {
     "regret": "Random worlds of 25 states and 4 actions with exact values known; every search gets the same crude leaf values "
     "(exact value plus noise as large as the values' spread), but for searches by random play. 1 is what a random action loses, "
     "0 is perfect; error: standard error over worlds. At most 15 steps deep in mctx.",
-    "speed": "Processor time on one core, the median of several calls. Only ratios within one run mean something. A node of "
+    "speed": "Processor time on one core, the median of several calls. Only ratios within one run mean something. A "
+    "simulation of mbagent's search on a known machine is at most 3 steps, with the machine's own probabilities; with random "
+    "play it goes on to the horizon; a peer's ends where its tree does. A node of "
     "chance is a simulation of its own in Stochastic MuZero.",
     "naive": "Microseconds of processor time for one state. Naive: a full forward pass of predictor and conditioner in torch for "
     "every variable. bar: the ratio asked for.",

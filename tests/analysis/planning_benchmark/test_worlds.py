@@ -4,7 +4,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from mbagent.analysis.planning_benchmark.ours import OWN_SEARCHES, TableSearch, TableWorldModel
+from mbagent.analysis.planning_benchmark.ours import OWN_SEARCHES, TableSearch, as_model
 from mbagent.analysis.planning_benchmark.page import write_page
 from mbagent.analysis.planning_benchmark.peers import PeerError, run_peer
 from mbagent.analysis.planning_benchmark.regret import Settings, build_arena, compare, score
@@ -46,7 +46,7 @@ def test_a_perfect_search_has_no_regret_and_random_choice_a_regret_of_one() -> N
 
 def test_the_planner_on_a_table_needs_no_luck_where_one_action_is_far_better() -> None:
     world = random_world("dense", 0)
-    model = TableWorldModel(world.table, world.ends)
+    model = as_model(world)
     states, actions = np.full((4000, 1), 3), np.zeros(4000, dtype=np.int64)
     drawn, ended = model.sample(states, actions, np.random.default_rng(0))
     assert np.abs(np.bincount(drawn[:, 0], minlength=25) / 4000 - world.table[3, 0]).max() < 0.04
