@@ -183,7 +183,8 @@ def main(argv: list[str] | None = None) -> int:
             if rows:
                 tables[name] = rows
                 save(args.output / f"{name.replace(' ', '_')}.csv", rows)
-    pictures = write_page(args.output / "report.html", tables, "scripts/benchmark_planner.py")
+    options = sys.argv[1:] if argv is None else argv
+    pictures = write_page(args.output / "report.html", tables, " ".join(["scripts/benchmark_planner.py", *options]))
     for name, png in pictures.items():
         (args.output / f"{name}.png").write_bytes(png)
     for name, rows in tables.items():
