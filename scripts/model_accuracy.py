@@ -30,7 +30,7 @@ from rich.table import Table
 from mbagent.analysis.folders import replaced, set_aside
 from mbagent.analysis.model_accuracy.experiment import CASES, Outcome, Score, Settings, means, plan, run_task
 from mbagent.analysis.model_accuracy.page import averaged, shown, write_page
-from mbagent.analysis.model_accuracy.studies import STUDIES
+from mbagent.analysis.model_accuracy.studies import STUDIES, Study, parts
 from mbagent.analysis.parallel import run_all
 
 
@@ -101,9 +101,10 @@ def show(scores: list[Score], console: Console) -> None:
 
 @dataclass(frozen=True)
 class Question:
-    """One study with one seed."""
+    """One study, or a part of it, with one seed."""
 
     study: str
+    work: Study
     seed: int
     full: bool
 
@@ -111,7 +112,7 @@ class Question:
 def answer(question: Question) -> tuple[Question, list[dict[str, Any]]]:
     """Runs a study."""
     torch.set_num_threads(1)
-    return question, STUDIES[question.study](question.seed, question.full)
+    return question, question.work(question.seed, question.full)
 
 
 def check_studies(names: Sequence[str]) -> None:
@@ -168,7 +169,12 @@ def main(argv: list[str] | None = None) -> int:
         save(args.output / "results.csv", scores)
     if scores:
         show(scores, console)
-    questions = [Question(name, args.first_seed + i, args.full) for name in args.studies for i in range(settings.seeds)]
+    questions = [
+        Question(name, work, args.first_seed + i, args.full)
+        for name in args.studies
+        for i in range(settings.seeds)
+        for work in parts(name, args.full)
+    ]
     for question, found in run_all(
         answer, questions, workers=args.workers, console=console, name=lambda done: f"{done[0].study}, seed {done[0].seed}"
     ):

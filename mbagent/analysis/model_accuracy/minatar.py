@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import gymnasium as gym
 import numpy as np
@@ -102,28 +102,38 @@ def frames(name: str, sticky: float, k: int, n_steps: int, seed: int) -> tuple[F
     return space, data, same / n_steps
 
 
-def minatar(seed: int, full: bool) -> list[Row]:
+class Variant(NamedTuple):
+    """A game with or without sticky actions and a history."""
+
+    game: str
+    sticky: float
+    history: int
+
+
+def variants(full: bool) -> list[Variant]:
+    """What is measured one after another; Freeway takes minutes and is left to ``full``."""
+    names = [name for name in GAMES if full or name != "freeway"]
+    return [Variant(name, sticky, k) for name in names for sticky in (0.0, 0.1) for k in (0, GAMES[name])]
+
+
+def minatar(seed: int, full: bool, variant: Variant | None = None) -> list[Row]:
     """Share of frames of new episodes that are foretold exactly, after 50,000 steps.
 
     Freeway with a history of five steps has 5,700 factors, and a fit takes minutes. Five steps are what its slowest cars take;
     the chicken's timer at the lower border could be told in about 99% of frames: steps down that lead nowhere set it unseen.
     """
-    steps, rows = 50_000 if full else 5000, []
-    for name, k in GAMES.items():
-        if not full and name == "freeway":
-            continue  # takes minutes
-        for sticky in (0.0, 0.1):
-            for history in (0, k):
-                space, data, _ = frames(name, sticky, history, steps, seed)
-                _, tests, ceiling = frames(name, sticky, history, 5000, seed + 10_000)
-                model = build_model("auto", space, data.n_actions, 0.02)
-                report, test = model.fit(data, seed=0), tests.rows()
-                found, ends = likeliest(model, test.states, test.actions)
-                assert space.planes is not None
-                shown = [space.planes.to_planes(states) for states in (found, test.next_states)]
-                channels = Frames(name, sticky).n_channels
-                hit = (shown[0][:, :channels] == shown[1][:, :channels]).all(axis=(1, 2, 3))
-                figures = {"exact frame": float(hit.mean()), "ceiling": ceiling, "fit seconds": report.seconds}
-                figures["end foretold"] = float((ends == test.terminated).mean())
-                rows.append({"game": name, "sticky": sticky, "history": history, "steps": steps, **figures})
-    return rows
+    if variant is None:
+        return [row for each in variants(full) for row in minatar(seed, full, each)]
+    (name, sticky, k), steps = variant, 50_000 if full else 5000
+    space, data, _ = frames(name, sticky, k, steps, seed)
+    _, tests, ceiling = frames(name, sticky, k, 5000, seed + 10_000)
+    model = build_model("auto", space, data.n_actions, 0.02)
+    report, test = model.fit(data, seed=0), tests.rows()
+    found, ends = likeliest(model, test.states, test.actions)
+    assert space.planes is not None
+    shown = [space.planes.to_planes(states) for states in (found, test.next_states)]
+    channels = Frames(name, sticky).n_channels
+    hit = (shown[0][:, :channels] == shown[1][:, :channels]).all(axis=(1, 2, 3))
+    figures = {"exact frame": float(hit.mean()), "ceiling": ceiling, "fit seconds": report.seconds}
+    figures["end foretold"] = float((ends == test.terminated).mean())
+    return [{**variant._asdict(), "steps": steps, **figures}]

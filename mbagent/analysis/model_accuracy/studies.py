@@ -24,7 +24,7 @@ from mbagent.agent import ModelLearningAgent
 from mbagent.analysis.cases import find_case, measure_scale
 from mbagent.analysis.model_accuracy.changed import CHANGES
 from mbagent.analysis.model_accuracy.experiment import CASES, LEARNING_RATE, certain_factors, random_play
-from mbagent.analysis.model_accuracy.minatar import minatar
+from mbagent.analysis.model_accuracy.minatar import minatar, variants
 from mbagent.models.base import Bools, Floats, TransitionModel
 from mbagent.models.factory import build_model
 from mbagent.models.graphs import DecisionGraphModel, LocalGraphModel
@@ -255,7 +255,9 @@ def agents(seed: int, full: bool) -> list[Row]:
     return [{"game": "Maneuverer", **returns, "learned - true, normalised": gap, **seconds}]
 
 
-STUDIES: dict[str, Callable[[int, bool], list[Row]]] = {
+Study: TypeAlias = Callable[[int, bool], list[Row]]
+
+STUDIES: dict[str, Study] = {
     "changes": changes,
     "alarms": alarms,
     "transfer": transfer,
@@ -265,3 +267,8 @@ STUDIES: dict[str, Callable[[int, bool], list[Row]]] = {
     "agents": agents,
     "minatar": minatar,
 }
+
+
+def parts(study: str, full: bool) -> list[Study]:
+    """A study as pieces of work that may run, and be kept, one by one."""
+    return [partial(minatar, variant=each) for each in variants(full)] if study == "minatar" else [STUDIES[study]]
