@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from mbagent.models.base import Floats, States, TransitionModel
+from mbagent.models.base import Actions, Floats, States, TransitionModel
 from mbagent.models.state_graph import Indices, StateGraph
+from mbagent.planning.fitted_values import Task, learn_values
 from mbagent.planning.foresight import Foresight, best_behaviour
 from mbagent.planning.goal import Goal
+from mbagent.planning.leaf_values import LOWEST_KNOWN
 from mbagent.planning.lookahead import grow_lookahead
 from mbagent.planning.planner import Plan, PlannerSettings, best_actions
+from mbagent.planning.rehearsal import Way, best_way
 from mbagent.planning.value_iteration import Machine, Values, break_ties, solve
+
+REHEARSED: dict[str, Any] = {"time_budget": None, "reuse_tree": False}
+"""Settings while ways to look ahead are compared: the outcome must hang on neither the clock nor the order."""
 
 ROOTS_AT_ONCE = 16
 """Roots that are imagined around together; bounds the memory."""
@@ -53,14 +60,15 @@ class MachinePlanner:
         self._start: States | None = None
         self._machine: Machine | None = None
         self._imagined: StateGraph | None = None
+        self._way: Way | None = None
 
     def set_model(self, model: TransitionModel, start_states: States) -> None:
         """See Planner. The machine is generated at the next ``plan``."""
-        self._model, self._start, self._machine, self._imagined = model, start_states, None, None
+        self._model, self._start, self._machine, self._imagined, self._way = model, start_states, None, None, None
 
     def set_goal(self, goal: Goal) -> None:
         """See Planner. The machine stays, its values go."""
-        self._goal = goal
+        self._goal, self._way = goal, None
         if self._machine is not None:
             self._machine.values = None
 
@@ -112,17 +120,40 @@ class MachinePlanner:
 
     def _lookahead(self, roots: States) -> tuple[StateGraph, Values, Indices]:
         """A machine around each root [R, F], solved; root r is in group r. Returns (graph, values, root nodes)."""
-        graph, settings = self._empty_graph(), self.settings
+        way, graph, settings = self._chosen_way(), self._empty_graph(), self.settings
         nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
-        grow_lookahead(
-            graph,
-            nodes,
-            settings.lookahead_states,
-            settings.lookahead_samples,
-            settings.horizon,
-            settings.seed,
-        )
-        return graph, solve(graph, self._known_goal(), settings.gamma, n_groups=len(roots)), nodes
+        grow_lookahead(graph, nodes, way.states, way.samples, settings.horizon, settings.seed)
+        return graph, solve(graph, self._known_goal(), settings.gamma, len(roots), way.leaf), nodes
+
+    def _chosen_way(self) -> Way:
+        """How to look ahead under this goal: as the settings say, or with learned values where that plays better."""
+        if self._way is None:
+            settings, start = self.settings, self._start
+            usual = Way(LOWEST_KNOWN, settings.lookahead_states, settings.lookahead_samples)
+            self._way = usual
+            if settings.learn_values and start is not None and len(start):
+                self._way = self._rehearse(
+                    usual, Task(self._known_model(), self._known_goal(), start, settings.gamma, settings.seed)
+                )
+        return self._way
+
+    def _rehearse(self, usual: Way, task: Task) -> Way:
+        """Learns values for the goal, and finds out whether plans are better with them."""
+        settings = self.settings
+        self._way = None  # should the goal fail now, it is tried again
+        leaf = learn_values(task)
+        if len(leaf.weights) == 0:
+            return usual
+
+        def act(way: Way, states: States) -> Actions:
+            self._way = way
+            return best_actions(self._imagine(states).scores)
+
+        self.settings = replace(settings, **REHEARSED)
+        try:
+            return best_way(task, usual, (Way(leaf, 1, settings.n_samples), usual._replace(leaf=leaf)), act)
+        finally:
+            self.settings, self._way = settings, None
 
     def _solved_machine(self) -> Machine:
         if self._machine is None:

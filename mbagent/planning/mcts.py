@@ -101,7 +101,7 @@ class MctsPlanner(MachinePlanner):
             return None
         graph = self._spare = self._spare if self._spare is not None else StateGraph(self._known_model())
         tables = carry_over(last.graph, last.tables, root, graph)
-        if self.settings.leaf_values == "machine" and 2 * graph.expanded.sum() < self.settings.lookahead_states:
+        if self.settings.leaf_values == "machine" and 2 * graph.expanded.sum() < self._chosen_way().states:
             return None
         self._imagined, self._spare = graph, last.graph
         return _Search(self, graph, tables, np.zeros(1, dtype=np.int64), last.decision + 1)
@@ -163,7 +163,7 @@ class _Search:
     def _result(self) -> Imagined:
         graph, roots, t = self.graph, self.roots, self.tables
         n, m, visits = len(graph), graph.n_edges, self.tables.root_visits
-        solution = Values(t.v[:n], t.q[:n], t.rewards[:m], t.frontier)
+        solution = Values(t.v[:n], t.q[:n], t.rewards[:m], t.frontier, t.leaf)
         if self.settings.backup == "mean":
             return Imagined(graph, roots, solution, visits, visits + 1e-6 * _unit(t.q[roots]), t.visits[:n])
         settle(graph, solution, self.settings.gamma, FINAL_SWEEPS)
@@ -209,7 +209,7 @@ def _first_tables(solution: Values, roots: Ints) -> Tables:
     q, spread = solution.q, solution.v[roots]
     return Tables(
         solution.v, q, np.zeros_like(q), np.zeros_like(q), solution.rewards, solution.frontier,
-        np.zeros((len(roots), q.shape[1])), np.ones(len(roots)), np.stack([spread, spread], axis=1),
+        np.zeros((len(roots), q.shape[1])), np.ones(len(roots)), np.stack([spread, spread], axis=1), solution.leaf,
     )  # fmt: skip
 
 

@@ -28,6 +28,9 @@ class PlannerSettings:
         lookahead_states: states imagined around each root where the whole machine is larger than that.
         n_samples: draws for a (state, action) whose successors are too many to enumerate, in the whole machine.
         lookahead_samples: the same near a root, where the whole machine is too large.
+        learn_values: whether, where the whole machine is too large, values are learned in imagination, once for each goal. They
+            take the place of ``lookahead_states`` and ``lookahead_samples``, or are added to them, where that plays better in
+            imagination.
         leaf_values: "machine" (values of the reachable machine) or "rollouts" (random play).
         backup: "max" (an action is worth what the best behaviour after it is worth) or "mean" (plain UCT).
         choice: "mean", or "greatest" as in the paper (flat Monte Carlo only; it seeks risk).
@@ -55,6 +58,7 @@ class PlannerSettings:
     lookahead_states: int = 160
     n_samples: int = 16
     lookahead_samples: int = 4
+    learn_values: bool = True
     leaf_values: Literal["machine", "rollouts"] = "machine"
     backup: Literal["max", "mean"] = "max"
     choice: Literal["mean", "greatest"] = "mean"
@@ -99,8 +103,9 @@ class PlannerSettings:
             if not number or not 0.0 < budget < math.inf:
                 raise ValueError(f"time_budget must be a finite number of seconds above 0, or None, got {budget!r}.")
             object.__setattr__(self, "time_budget", float(budget))
-        if not isinstance(self.reuse_tree, bool):
-            raise ValueError(f"reuse_tree must be True or False, got {self.reuse_tree!r}.")
+        for name in ("reuse_tree", "learn_values"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} must be True or False, got {getattr(self, name)!r}.")
         choices = {
             "leaf_values": ("machine", "rollouts"),
             "backup": ("max", "mean"),

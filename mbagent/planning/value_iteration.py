@@ -11,6 +11,7 @@ from mbagent.models.base import Bools, Floats, States, TransitionModel
 from mbagent.models.reachable import grow_reachable
 from mbagent.models.state_graph import GraphArrays, Indices, StateGraph
 from mbagent.planning.goal import Goal
+from mbagent.planning.leaf_values import LOWEST_KNOWN, LeafValues, evaluate
 from mbagent_envs._compiled import compiled
 
 TOLERANCE = 1e-7
@@ -32,13 +33,15 @@ class Values:
         v: float64 [N], value of each state with the best action; of unexpanded ones the frontier's value.
         q: float64 [N, A], value of each action; zero rows for unexpanded states.
         rewards: float64 [M], reward of every successor edge.
-        frontier: float64 [G], value of unexpanded states in each group.
+        frontier: float64 [G], value of unexpanded states in each group where nothing was learned of them.
+        leaf: what they are worth.
     """
 
     v: Floats
     q: Floats
     rewards: Floats
     frontier: Floats
+    leaf: LeafValues = LOWEST_KNOWN
 
 
 def score_edges(graph: StateGraph, goal: Goal, start: int = 0) -> Floats:
@@ -49,21 +52,24 @@ def score_edges(graph: StateGraph, goal: Goal, start: int = 0) -> Floats:
     return goal(graph.states[sources], graph.actions[start:], graph.states[next_nodes])
 
 
-def solve(graph: StateGraph, goal: Goal, gamma: float, n_groups: int = 1) -> Values:
+def solve(graph: StateGraph, goal: Goal, gamma: float, n_groups: int = 1, leaf: LeafValues = LOWEST_KNOWN) -> Values:
     """Value iteration from scratch.
 
-    States that were never expanded are worth the lowest of their group's expanded states, found together with the
-    values. Zero would make every cost end, and every income stop, at the edge of what was imagined; the mean would
-    make that edge more attractive than a prize whose sequel is badly imagined, and the agent walk about for ever.
+    States that were never expanded are worth what ``leaf`` says; where it says nothing, the lowest of their group's
+    expanded states, found together with the values. Zero would make every cost end, and every income stop, at the edge of
+    what was imagined; the mean would make that edge more attractive than a prize whose sequel is badly imagined, and the
+    agent walk about for ever.
 
     Args:
         graph: what was imagined.
         goal: what is wanted.
         gamma: discount, below one.
         n_groups: groups of the graph are numbered 0 ... n_groups - 1.
+        leaf: what states that were never expanded are worth, if that was learned.
     """
     nothing = np.zeros((len(graph), graph.model.n_actions))
-    values = Values(nothing[:, 0].copy(), nothing, score_edges(graph, goal), np.zeros(n_groups))
+    values = Values(nothing[:, 0].copy(), nothing, score_edges(graph, goal), np.zeros(n_groups), leaf)
+    evaluate(leaf, graph.states, graph.expanded, values.v)
     settle(graph, values, gamma)
     return values
 
@@ -81,7 +87,7 @@ def settle(graph: StateGraph, values: Values, gamma: float, max_sweeps: int = MA
         only: bool [G], the groups to work on; None for all.
     """
     active = np.ones(len(values.frontier), dtype=np.bool_) if only is None else only.copy()
-    sweep(graph.arrays, values.rewards, gamma, TOLERANCE, max_sweeps, active, values.v, values.q, values.frontier)
+    sweep(graph.arrays, values.rewards, gamma, TOLERANCE, max_sweeps, active, values.v, values.q, values.frontier, values.leaf)
 
 
 @compiled
@@ -121,8 +127,9 @@ def sweep(
     v: Floats,
     q: Floats,
     frontier: Floats,
+    leaf: LeafValues,
 ) -> None:
-    """Sweeps over the ``active`` groups (overwritten); updates the last three arguments (see Values).
+    """Sweeps over the ``active`` groups (overwritten); updates ``v``, ``q`` and ``frontier`` (see Values).
 
     ``rewards``, ``v`` and ``q`` are as long as the graph has edges and nodes in use.
     """
@@ -144,7 +151,8 @@ def sweep(
             moved[g] = max(moved[g], abs(best - v[s]))
             v[s] = best
             lows[g] = min(lows[g], best)
-        _set_frontier(graph, active, lows, moved, v, frontier)
+        if len(leaf.weights) == 0:
+            _set_frontier(graph, active, lows, moved, v, frontier)
         active &= moved > tolerance * scale
         if not active.any():
             break

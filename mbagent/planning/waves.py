@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.state_graph import GraphArrays
+from mbagent.planning.leaf_values import LeafValues, leaf_value
 from mbagent.planning.tree import Ints, Paths, back_up_max, back_up_mean, initialise, select
 from mbagent.planning.value_iteration import TOLERANCE, sweep
 from mbagent_envs._compiled import compiled
@@ -35,6 +36,7 @@ class Tables(NamedTuple):
         root_visits: simulations through the roots' actions, [R, A].
         spans: range of the values around each root, [R].
         extremes: lowest and highest return seen, [R, 2].
+        leaf: what is known of unexpanded nodes.
     """
 
     v: Floats
@@ -46,6 +48,7 @@ class Tables(NamedTuple):
     root_visits: Floats
     spans: Floats
     extremes: Floats
+    leaf: LeafValues
 
 
 class Rules(NamedTuple):
@@ -156,7 +159,8 @@ def end_wave(
     n, m = graph.sizes[0], graph.sizes[1]
     v, q, rewards = tables.v[:n], tables.q[:n], tables.rewards[:m]
     for node in range(n_before, n):
-        v[node] = tables.frontier[graph.groups[node]]
+        known = len(tables.leaf.weights) > 0
+        v[node] = leaf_value(tables.leaf, graph.states[node]) if known else tables.frontier[graph.groups[node]]
         q[node], tables.visits[node], tables.counted[node] = 0.0, 0.0, 0.0
     if not rules.rollouts:
         initialise(leaves, graph, rewards, rules.gamma, v, q)
@@ -164,7 +168,7 @@ def end_wave(
             active = np.zeros(len(tables.frontier), dtype=np.bool_)
             for node in widened:
                 active[graph.groups[node]] = True
-            sweep(graph, rewards, rules.gamma, TOLERANCE, WIDENING_SWEEPS, active, v, q, tables.frontier)
+            sweep(graph, rewards, rules.gamma, TOLERANCE, WIDENING_SWEEPS, active, v, q, tables.frontier, tables.leaf)
         for r in range(len(roots)):
             for w in range(paths.ends.shape[1]):
                 end_values[r, w] = v[paths.ends[r, w]] if paths.ends[r, w] >= 0 else 0.0

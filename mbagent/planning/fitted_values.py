@@ -1,0 +1,177 @@
+"""Values learned in imagination, for worlds too large to solve: fitted value iteration with a weight for each factor's value.
+
+States are met by imagined play, at first at random and then by the values found so far; values are backed up through the
+model's successors and fitted by ridge regression, over and over (Gordon 1995; Guestrin, Koller, Parr and Venkataraman 2003
+for sums over factors). They hold for one goal and are forgotten with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from mbagent.models.base import Actions, States, TransitionModel
+from mbagent.models.state_graph import GraphArrays, StateGraph
+from mbagent.planning.goal import Goal
+from mbagent.planning.leaf_values import LOWEST_KNOWN, Floats, Indices, LeafValues, evaluate
+from mbagent.planning.value_iteration import bellman, score_edges
+from mbagent_envs._compiled import compiled
+from mbagent_envs.random_keys import derive
+
+ROUNDS = 3
+"""Times that play, and the fit after it, are repeated."""
+
+STATES_A_ROUND = 600
+"""States taken from each round of play."""
+
+PLAYERS = 64
+"""Episodes imagined side by side."""
+
+STEPS = 40
+"""Steps of each of them."""
+
+CHANCE = 0.2
+"""Share of random actions once there are values to play by."""
+
+SAMPLES = 4
+"""Draws for each (state, action)."""
+
+SAMPLED_TOGETHER = 64
+"""States that share their luck; many different lucks make values means over it."""
+
+SWEEPS = 150
+"""Backups and fits in a round, at most."""
+
+SETTLED = 1e-4
+"""They end when no value moves by more than this share of the largest reward."""
+
+RIDGE = 1.0
+"""Strength of the pull towards equal weights, in states."""
+
+_PLAY_SALT, _EXPAND_SALT, _SAMPLE_SALT = 0xF1A1, 0xF1A2, 0xF1A3
+
+
+@dataclass(frozen=True)
+class Task:
+    """What values are learned for.
+
+    Attributes:
+        model: what to imagine with.
+        goal: what is wanted.
+        start: int64 [S, F], start states.
+        gamma: discount.
+        seed: which random numbers.
+    """
+
+    model: TransitionModel
+    goal: Goal
+    start: States
+    gamma: float
+    seed: int
+
+
+@compiled
+def _back_up(graph: GraphArrays, rewards: Floats, gamma: float, nodes: Indices, v: Floats, q: Floats, out: Floats) -> None:
+    for i in range(len(nodes)):
+        out[i] = bellman(nodes[i], graph, rewards, gamma, v, q)
+
+
+class _Regression:
+    """Ridge regression of values on the one-hot values of factors, for many targets on the same states.
+
+    Args:
+        states: int64 [N, F].
+        cardinalities: of the factors.
+    """
+
+    def __init__(self, states: States, cardinalities: tuple[int, ...]) -> None:
+        counts = np.asarray(cardinalities)
+        self.first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
+        columns = np.zeros((len(states), int(counts.sum())))
+        columns[np.arange(len(states))[:, None], self.first + states] = 1.0
+        self._used = np.flatnonzero(columns.min(axis=0) < columns.max(axis=0))
+        self._mean = columns[:, self._used].mean(axis=0)
+        self._centred = columns[:, self._used] - self._mean
+        self._size = columns.shape[1]
+        wide = len(self._used) > len(states)
+        x = self._centred if not wide else self._centred.T
+        self._factor, self._wide = cho_factor(x.T @ x + RIDGE * np.eye(x.shape[1])), wide
+
+    def fit(self, values: Floats) -> Floats:
+        """Weights [sum of cardinalities + 1] for values [N] of the states."""
+        mean, x = values.mean(), self._centred
+        found = x.T @ cho_solve(self._factor, values - mean) if self._wide else cho_solve(self._factor, x.T @ (values - mean))
+        weights = np.zeros(self._size + 1)
+        weights[self._used] = found
+        weights[-1] = mean - float(found @ self._mean)
+        return weights
+
+
+def learn_values(task: Task) -> LeafValues:
+    """What states are worth under the best behaviour found in imagined play; ``LOWEST_KNOWN`` where all are worth the same."""
+    leaf, met = LOWEST_KNOWN, np.zeros((0, len(task.model.cardinalities)), dtype=np.int64)
+    for number in range(ROUNDS):
+        played = _play(task, leaf, number)
+        rng = np.random.default_rng([task.seed, number])
+        some = rng.choice(len(played), size=min(len(played), STATES_A_ROUND), replace=False)
+        met = np.unique(np.concatenate([met, played[np.sort(some)]]), axis=0)
+        leaf = _fit(task, met, leaf, number)
+    return leaf
+
+
+def _play(task: Task, leaf: LeafValues, number: int) -> States:
+    """States int64 [N, F] met by playing greedily on the values; by chance at first."""
+    rng = np.random.default_rng([task.seed, number, _PLAY_SALT])
+    states, met = task.start[rng.integers(len(task.start), size=PLAYERS)], []
+    for step in range(STEPS):
+        met.append(states)
+        actions = rng.integers(task.model.n_actions, size=PLAYERS)
+        if len(leaf.weights):
+            by_chance = rng.random(PLAYERS) < CHANCE
+            actions = np.where(by_chance, actions, greedy_actions(task, leaf, states, number * STEPS + step))
+        keys = derive(task.seed, _SAMPLE_SALT, number * STEPS + step, np.arange(PLAYERS))
+        after, over = task.model.sample(states, actions, keys)
+        again = task.start[rng.integers(len(task.start), size=PLAYERS)]
+        states = np.where(over[:, None], again, after)
+    return np.concatenate(met)
+
+
+def greedy_actions(task: Task, leaf: LeafValues, states: States, step: int) -> Actions:
+    """The actions [B] that are best one step ahead of states int64 [B, F]."""
+    graph = StateGraph(task.model)
+    nodes = graph.add(states, np.zeros(len(states), dtype=np.int64))
+    distinct, v, _, q, rewards = _expanded(task, graph, leaf, step)
+    _back_up(graph.arrays, rewards, task.gamma, distinct, v, q, np.empty(len(distinct)))
+    best: Actions = q.argmax(axis=1)[nodes]
+    return best
+
+
+def _expanded(task: Task, graph: StateGraph, leaf: LeafValues, step: int) -> tuple[Indices, Floats, Floats, Floats, Floats]:
+    """Expands all nodes of a graph; returns them, the values of what is met, room for new ones and for q, and the rewards."""
+    nodes = np.arange(len(graph))
+    for begin in range(0, len(nodes), SAMPLED_TOGETHER):
+        graph.expand(nodes[begin : begin + SAMPLED_TOGETHER], SAMPLES, int(derive(task.seed, _EXPAND_SALT, step, begin)[0]))
+    v, q = np.zeros(len(graph)), np.zeros((len(graph), task.model.n_actions))
+    evaluate(leaf, graph.states, np.zeros(len(graph), dtype=np.bool_), v)
+    return nodes, v, np.empty(len(nodes)), q, score_edges(graph, task.goal)
+
+
+def _fit(task: Task, states: States, leaf: LeafValues, number: int) -> LeafValues:
+    """Values fitted on states int64 [N, F], distinct, from the given ones on."""
+    graph = StateGraph(task.model)
+    graph.add(states, np.zeros(len(states), dtype=np.int64))
+    nodes, v, found, q, rewards = _expanded(task, graph, leaf, (ROUNDS + number) * STEPS)
+    if rewards.min() == rewards.max():
+        return LOWEST_KNOWN
+    regression = _Regression(graph.states[nodes], task.model.cardinalities)
+    low, high = (float(end) / (1.0 - task.gamma) for end in (min(rewards.min(), 0.0), max(rewards.max(), 0.0)))
+    none, moved = np.zeros(len(graph), dtype=np.bool_), SETTLED * float(np.abs(rewards).max())
+    for _ in range(SWEEPS):
+        _back_up(graph.arrays, rewards, task.gamma, nodes, v, q, found)
+        leaf, before = LeafValues(regression.fit(found), regression.first, low, high), v.copy()
+        evaluate(leaf, graph.states, none, v)
+        if np.abs(v - before).max() <= moved:
+            break
+    return leaf if np.isfinite(leaf.weights).all() else LOWEST_KNOWN
