@@ -60,56 +60,57 @@ def exp64(x: float) -> float:
 
 
 @vectorised
-def activate(values: Floats32, n: int, code: int) -> None:
-    """Applies the activation of this code to the first ``n`` values, in place."""
+def activate(table: Floats32, row: int, n: int, code: int) -> None:
+    """Applies the activation of this code to the first ``n`` values of ``table[row]``, in place."""
     if code == RELU:
         for h in range(n):
-            values[h] = max(values[h], np.float32(0.0))
+            table[row, h] = max(table[row, h], np.float32(0.0))
     elif code == SILU:
         for h in range(n):
-            values[h] = values[h] / (_ONE + exp32(-values[h]))
+            table[row, h] = table[row, h] / (_ONE + exp32(-table[row, h]))
     elif code == SIGMOID:
         for h in range(n):
-            values[h] = _ONE / (_ONE + exp32(-values[h]))
+            table[row, h] = _ONE / (_ONE + exp32(-table[row, h]))
     else:
         for h in range(n):
-            values[h] = _ONE - _TWO / (_ONE + exp32(_TWO * values[h]))
+            table[row, h] = _ONE - _TWO / (_ONE + exp32(_TWO * table[row, h]))
 
 
 @vectorised
-def add_rows(table: Floats32, rows: Ints, n_rows: int, out: Floats32) -> None:
-    """Adds the first ``n_rows`` of ``rows`` of ``table`` [rows, G] to ``out`` [G]; see ``add_columns``."""
+def add_rows(table: Floats32, rows: Ints, n_rows: int, out: Floats32, row: int) -> None:
+    """Adds the first ``n_rows`` of ``rows`` of ``table`` [rows, G] to ``out[row]`` [G]; see ``add_columns``."""
     c = 0
     while c + 4 <= n_rows:
         c0, c1, c2, c3 = rows[c], rows[c + 1], rows[c + 2], rows[c + 3]
         for h in range(table.shape[1]):
-            out[h] += (table[c0, h] + table[c1, h]) + (table[c2, h] + table[c3, h])
+            out[row, h] += (table[c0, h] + table[c1, h]) + (table[c2, h] + table[c3, h])
         c += 4
     while c < n_rows:
-        row = rows[c]
         for h in range(table.shape[1]):
-            out[h] += table[row, h]
+            out[row, h] += table[rows[c], h]
         c += 1
 
 
 @vectorised
-def add_products(values: Floats32, n_values: int, weights: Floats32, out: Floats32) -> None:
-    """Adds ``weights`` [4 * m, n_values or more] times ``values`` [n_values] to ``out`` [4 * m].
+def add_products(values: Floats32, n_rows: int, n_values: int, weights: Floats32, out: Floats32) -> None:
+    """Adds ``weights`` [4 * m, n_values or more] times ``values`` [rows, n_values or more] to the first rows of ``out`` [rows, 4 * m].
 
-    Four sums at a time: each of ``values`` is read a quarter as often.
+    Four sums at a time: each of ``values`` is read a quarter as often. All rows one after another with the same weights, while
+    these are at hand; what is computed of a row does not depend on that.
     """
-    for k in range(0, len(out), 4):
-        s0 = s1 = s2 = s3 = np.float32(0.0)
-        for h in range(n_values):
-            value = values[h]
-            s0 += value * weights[k, h]
-            s1 += value * weights[k + 1, h]
-            s2 += value * weights[k + 2, h]
-            s3 += value * weights[k + 3, h]
-        out[k] += s0
-        out[k + 1] += s1
-        out[k + 2] += s2
-        out[k + 3] += s3
+    for k in range(0, weights.shape[0], 4):
+        for r in range(n_rows):
+            s0 = s1 = s2 = s3 = np.float32(0.0)
+            for h in range(n_values):
+                value = values[r, h]
+                s0 += value * weights[k, h]
+                s1 += value * weights[k + 1, h]
+                s2 += value * weights[k + 2, h]
+                s3 += value * weights[k + 3, h]
+            out[r, k] += s0
+            out[r, k + 1] += s1
+            out[r, k + 2] += s2
+            out[r, k + 3] += s3
 
 
 @vectorised
@@ -202,18 +203,18 @@ def softmax(logits: Floats32, n: int, out: Floats) -> None:
 
 
 @vectorised
-def write_bits(columns: Floats32, logits: Floats32, b: int) -> None:
-    """Writes row b of ``logits`` [B, O, 2] where all factors are bits, from ``columns`` [O or more]; the logit of 0 is 0."""
+def write_bits(columns: Floats32, row: int, logits: Floats32, b: int) -> None:
+    """Writes row b of ``logits`` [B, O, 2] where all factors are bits, from ``columns[row]`` [O or more]; the logit of 0 is 0."""
     for i in range(logits.shape[1]):
         logits[b, i, 0] = np.float32(0.0)
-        logits[b, i, 1] = columns[i]
+        logits[b, i, 1] = columns[row, i]
 
 
 @vectorised
-def add_signed(states: Ints, b: int, weights: Floats32, row: int, out: Floats32) -> None:
-    """Adds ``weights[row]`` [F] to ``out`` where the bits of ``states[b]`` [F] are 1, and subtracts it where they are 0."""
+def add_signed(states: Ints, b: int, weights: Floats32, row: int, out: Floats32, out_row: int) -> None:
+    """Adds ``weights[row]`` [F] to ``out[out_row]`` where the bits of ``states[b]`` [F] are 1, and subtracts it where they are 0."""
     for i in range(states.shape[1]):
-        out[i] += np.float32(2 * states[b, i] - 1) * weights[row, i]
+        out[out_row, i] += np.float32(2 * states[b, i] - 1) * weights[row, i]
 
 
 @vectorised

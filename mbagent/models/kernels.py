@@ -20,11 +20,16 @@ from mbagent.models.arithmetic import (
     add_products,
     add_rows,
     add_signed,
+    copy_row,
     product,
     softmax,
     write_bits,
 )
-from mbagent_envs._compiled import compiled, inlined
+from mbagent_envs._compiled import borrowed, compiled, inlined
+
+
+ROWS = 32
+"""Rows of a batch that a predictor's layers are applied to one after another, with the same weights at hand."""
 
 
 class Layout(NamedTuple):
@@ -174,38 +179,58 @@ def next_place(states: Ints, b: int, i: int, layout: Layout, place: int) -> int:
 
 @inlined
 def _add_residual(
-    states: Ints, b: int, active: Ints, n_active: int, layout: Layout, stay: Floats32, columns: Floats32
+    states: Ints, b: int, active: Ints, n_active: int, layout: Layout, stay: Floats32, columns: Floats32, r: int
 ) -> None:
     """Adds what leads each state column to itself: its weight where it is 1, minus its weight where it is 0."""
     n_on = n_active - layout.n_steps
     for step in range(n_on, n_active):
         row = active[step] - layout.n_state_columns
         if layout.n_state_columns == states.shape[1]:  # all are bits
-            add_signed(states, b, stay, row, columns)
+            add_signed(states, b, stay, row, columns, r)
             continue
         for column in range(layout.n_state_columns):
-            columns[column] -= stay[row, column]
+            columns[r, column] -= stay[row, column]
         for a in range(n_on):
-            columns[active[a]] += np.float32(2.0) * stay[row, active[a]]
+            columns[r, active[a]] += np.float32(2.0) * stay[row, active[a]]
 
 
 @inlined
-def _dense_columns(active: Ints, n_active: int, dense: DenseWeights, now: Floats32, after: Floats32, columns: Floats32) -> None:
-    """The output columns of one row, without the residual path; ``now`` and ``after`` are work space [H]."""
+def _dense_block(
+    first: int,
+    n_rows: int,
+    states: Ints,
+    actions: Ints,
+    layout: Layout,
+    dense: DenseWeights,
+    active: Ints,
+    now: Floats32,
+    after: Floats32,
+    columns: Floats32,
+) -> None:
+    """The output columns [R, C] of rows from ``first`` on; ``active`` [F + n_steps], ``now`` and
+    ``after`` [R, H] are work space."""
     depth = len(dense.sizes)
-    columns[:] = dense.column_bias
-    if depth == 0:
-        add_rows(dense.first, active, n_active, columns)
-        return
-    now[:] = dense.bias[0]
-    add_rows(dense.first, active, n_active, now)
-    activate(now, dense.sizes[0], dense.activation)
+    for r in range(n_rows):
+        b = first + r
+        n_active = active_columns(states, b, actions[b], layout, active)
+        for column in range(columns.shape[1]):
+            columns[r, column] = dense.column_bias[column]
+        _add_residual(states, b, active, n_active, layout, dense.stay, columns, r)
+        if depth == 0:
+            add_rows(dense.first, active, n_active, columns, r)
+            continue
+        copy_row(dense.bias, 0, now, r)
+        add_rows(dense.first, active, n_active, now, r)
+        activate(now, r, dense.sizes[0], dense.activation)
     for level in range(1, depth):
-        after[:] = dense.bias[level]
-        add_products(now, dense.sizes[level - 1], dense.inner[level - 1], after)
-        activate(after, dense.sizes[level], dense.activation)
+        for r in range(n_rows):
+            copy_row(dense.bias, level, after, r)
+        add_products(now, n_rows, dense.sizes[level - 1], dense.inner[level - 1], after)
+        for r in range(n_rows):
+            activate(after, r, dense.sizes[level], dense.activation)
         now[:] = after
-    add_products(now, dense.sizes[depth - 1], dense.to_columns, columns)
+    if depth:
+        add_products(now, n_rows, dense.sizes[depth - 1], dense.to_columns, columns)
 
 
 @compiled
@@ -213,25 +238,26 @@ def dense_logits(states: Ints, actions: Ints, layout: Layout, dense: DenseWeight
     """A dense predictor's logits, float32 [B, O, K]; values a factor lacks are at -1e9."""
     n_outputs, width = len(layout.outputs), layout.outputs.max()
     logits = np.full((len(states), n_outputs, width), np.float32(-1e9), dtype=np.float32)
+    rows = min(len(states), ROWS)
     active = np.empty(states.shape[1] + layout.n_steps, dtype=np.int64)
-    now = np.empty(dense.to_columns.shape[1], dtype=np.float32)
+    now = np.empty((rows, dense.to_columns.shape[1]), dtype=np.float32)
     after = np.empty_like(now)
-    columns = np.empty(len(dense.column_bias), dtype=np.float32)
-    for b in range(len(states)):
-        n_active = active_columns(states, b, actions[b], layout, active)
-        _dense_columns(active, n_active, dense, now, after, columns)
-        _add_residual(states, b, active, n_active, layout, dense.stay, columns)
-        if width == 2:
-            write_bits(columns, logits, b)
-            continue
-        for i in range(n_outputs):
-            start = layout.start[i]
-            if layout.outputs[i] == 2:
-                logits[b, i, 0] = 0.0
-                logits[b, i, 1] = columns[start]
-            else:
-                for k in range(layout.outputs[i]):
-                    logits[b, i, k] = columns[start + k]
+    columns = np.empty((rows, len(dense.column_bias)), dtype=np.float32)
+    for first in range(0, len(states), ROWS):
+        n_rows = min(ROWS, len(states) - first)
+        _dense_block(first, n_rows, states, actions, layout, dense, active, now, after, columns)
+        for r in range(n_rows):
+            if width == 2:
+                write_bits(columns, r, logits, first + r)
+                continue
+            for i in range(n_outputs):
+                start = layout.start[i]
+                if layout.outputs[i] == 2:
+                    logits[first + r, i, 0] = 0.0
+                    logits[first + r, i, 1] = columns[r, start]
+                else:
+                    for k in range(layout.outputs[i]):
+                        logits[first + r, i, k] = columns[r, start + k]
     return logits
 
 
@@ -274,7 +300,7 @@ def finish(
     if n > 2:  # each node once, for all values
         for h in range(hidden.shape[1]):
             hidden[0, h] = sums[row, h]
-        activate(hidden.reshape(-1), hidden.shape[1], code)
+        activate(hidden, 0, hidden.shape[1], code)
         for k in range(n):
             row_logits[k] = group.offset[g, k] + product(hidden, 0, LINEAR, group.to_values, g, k)
     else:
