@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent_envs._compiled import compiled, vectorised
+from mbagent_envs._compiled import compiled, inlined, vectorised
 
 Floats32 = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -181,12 +181,12 @@ def product(sums: Floats32, row: int, code: int, table: Floats32, g: int, k: int
     return total
 
 
-@compiled
+@inlined
 def softmax(logits: Floats32, n: int, out: Floats) -> None:
     """Writes the distribution over the first ``n`` values to ``out``."""
     if n == 2:  # one exponential instead of two: bits are the common case
         difference = np.float64(logits[1]) - np.float64(logits[0])
-        small = math.exp(-abs(difference))
+        small = exp64(-abs(difference))
         large = 1.0 / (1.0 + small)
         out[0] = small * large if difference > 0 else large
         out[1] = large if difference > 0 else small * large

@@ -18,7 +18,7 @@ LEEWAY = 2.0
 ROWS = 64
 """Rows that are worked on together, at most."""
 
-SUMS = 2**16
+SUMS = 2**15
 """Numbers in the summed inputs of all open factors of these rows, at most: more would not stay in the processor's cache."""
 
 ALWAYS = 2.0
