@@ -28,8 +28,9 @@ def compiled(function: _F) -> _F:
 def vectorised(function: _F) -> _F:
     """As ``compiled``, for small loops over arrays of floats: they work on several numbers at once.
 
-    For that, sums may be taken in another order than written, though always in the same one for the same lengths, a product may be
-    added without being rounded first, and nothing is raised when something is divided by zero.
+    For that, sums may be taken in another order than written, though always in the same one for the same lengths; a product may
+    be added without being rounded first; and nothing is raised when something is divided by zero. Arrays must be known to lie
+    in one piece: those that ``a, b = np.empty((2, n))`` unpacks are not.
     """
     return _kept(
         numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})(function), function

@@ -40,7 +40,7 @@ def exp32(x: np.float32) -> np.float32:
     r = (x - n * _LN2_HIGH) - n * _LN2_LOW
     series = ((((_P0 * r + _P1) * r + _P2) * r + _P3) * r + _P4) * r + _P5
     power = np.int32((np.int32(n) + 127) << 23).view(np.float32)
-    return ((series * r) * r + r + _ONE) * power
+    return np.float32(((series * r) * r + r + _ONE) * power)
 
 
 _T0, _T1, _T2, _T3, _T4, _T5, _T6 = (1.0 / math.factorial(k) for k in range(7))
@@ -93,7 +93,7 @@ def add_rows(table: Floats32, rows: Ints, n_rows: int, out: Floats32, row: int) 
 
 @vectorised
 def add_products(values: Floats32, n_rows: int, n_values: int, weights: Floats32, out: Floats32) -> None:
-    """Adds ``weights`` [4 * m, n_values or more] times ``values`` [rows, n_values or more] to the first rows of ``out`` [rows, 4 * m].
+    """Adds ``weights`` [4 * m, H] times the first ``n_values`` of ``values`` [R, H] to the first ``n_rows`` of ``out`` [R, 4 * m].
 
     Four sums at a time: each of ``values`` is read a quarter as often. All rows one after another with the same weights, while
     these are at hand; what is computed of a row does not depend on that.
@@ -186,7 +186,7 @@ def softmax(logits: Floats32, n: int, out: Floats) -> None:
     """Writes the distribution over the first ``n`` values to ``out``."""
     if n == 2:  # one exponential instead of two: bits are the common case
         difference = np.float64(logits[1]) - np.float64(logits[0])
-        small = exp64(-abs(difference))
+        small = math.exp(-abs(difference))
         large = 1.0 / (1.0 + small)
         out[0] = small * large if difference > 0 else large
         out[1] = large if difference > 0 else small * large
@@ -212,7 +212,7 @@ def write_bits(columns: Floats32, row: int, logits: Floats32, b: int) -> None:
 
 @vectorised
 def add_signed(states: Ints, b: int, weights: Floats32, row: int, out: Floats32, out_row: int) -> None:
-    """Adds ``weights[row]`` [F] to ``out[out_row]`` where the bits of ``states[b]`` [F] are 1, and subtracts it where they are 0."""
+    """Adds ``weights[row]`` [F] to ``out[out_row]`` where the bits ``states[b]`` [F] are 1, and subtracts it where they are 0."""
     for i in range(states.shape[1]):
         out[out_row, i] += np.float32(2 * states[b, i] - 1) * weights[row, i]
 

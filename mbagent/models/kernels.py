@@ -25,8 +25,7 @@ from mbagent.models.arithmetic import (
     softmax,
     write_bits,
 )
-from mbagent_envs._compiled import borrowed, compiled, inlined
-
+from mbagent_envs._compiled import compiled, inlined
 
 ROWS = 32
 """Rows of a batch that a predictor's layers are applied to one after another, with the same weights at hand."""
@@ -151,7 +150,7 @@ def active_columns(states: Ints, b: int, action: int, layout: Layout, out: Ints)
 def add_next(
     states: Ints, b: int, i: int, value: int, layout: Layout, group: GroupWeights, columns: Ints, n: int, place: int
 ) -> int:
-    """Adds what a group sees of factor i's next value to the list ``columns`` of ``active_columns``; returns its new length ``n``.
+    """Adds what a group sees of factor i's next value to the list ``columns`` of ``active_columns``; returns its new length.
 
     ``place`` is where the list has the state's column of the factor, if that is on. Written without branches: bits cannot be
     foretold.
@@ -207,8 +206,7 @@ def _dense_block(
     after: Floats32,
     columns: Floats32,
 ) -> None:
-    """The output columns [R, C] of rows from ``first`` on; ``active`` [F + n_steps], ``now`` and
-    ``after`` [R, H] are work space."""
+    """The output columns [R, C] of rows from ``first`` on; ``active``, ``now`` and ``after`` [R, H] are work space."""
     depth = len(dense.sizes)
     for r in range(n_rows):
         b = first + r

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mbagent.models.base import Actions, States
 from mbagent.models.arithmetic import ACTIVATION_CODES, Floats32
+from mbagent.models.base import Actions, States
 from mbagent.models.kernels import DenseWeights, GroupWeights, Layout, dense_logits
 from mbagent.models.networks import Affine, Conditioner, DensePredictor, FactorCodec
 from mbagent.models.plane_kernels import pack_planes, plane_logits

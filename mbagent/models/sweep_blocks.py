@@ -1,4 +1,4 @@
-"""What sweeps begin with, for a block of rows: the first guess, and the summed inputs of the factors that are open. See ``sweeps.py``."""
+"""What ``sweeps.py`` begins with, for a block of rows: the first guess, and the summed inputs of the factors that are open."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SUMS = 2**15
 """Numbers in the summed inputs of all open factors of these rows, at most: more would not stay in the processor's cache."""
 
 ALWAYS = 2.0
-"""A bound that no random number reaches."""
+"""A bound that no random number reaches: as ``low`` it marks an open factor."""
 
 
 class Block(NamedTuple):
@@ -83,6 +83,7 @@ class SweepWork(NamedTuple):
 
 @compiled
 def work_space(n_rows: int, layout: Layout, group: GroupWeights) -> tuple[Block, SweepWork]:
+    """Room for a block, and for a row, of ``n_rows`` rows of a model of this shape."""
     n_outputs, size, n_values = len(layout.outputs), group.bias.shape[1], group.offset.shape[1]
     n_columns, n_active, rows = group.both_start - group.next_start, n_outputs + layout.n_steps, min(n_rows, ROWS)
     n_slots = 1 + max(n_outputs, min(rows * n_outputs, SUMS // size))

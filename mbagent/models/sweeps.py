@@ -53,7 +53,9 @@ def sample_sweeps(
         keys: uint64 [B].
         layout: the factors.
         group: the conditioner, masked "others".
-        certain: factors are left to the predictor as in ``sample_causal``: drawn once, then left alone.
+        certain: a factor whose likeliest value has this probability in the predictor's eyes takes that value in every sweep,
+            without the conditioner, unless the number drawn for it lies so far out that the conditioner could say otherwise
+            by raising the odds ``LEEWAY`` times. Where it never raises them more, the draws are those of the full sweep.
         sweeps: passes; each in a random order of its own.
         real_guess: the first guess is the predictor's probabilities; else bits drawn from them.
 
@@ -68,9 +70,7 @@ def sample_sweeps(
         sum_up(n_rows, layout, group, real_guess, block)
         for r in range(n_rows):
             b = first + r
-            _sweep_row(
-                b, r, states, actions[b], logits, keys[b], layout, group, sweeps, real_guess, block, work, factors
-            )
+            _sweep_row(b, r, states, actions[b], logits, keys[b], layout, group, sweeps, real_guess, block, work, factors)
         first += n_rows
     return factors
 

@@ -17,8 +17,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from mbagent.models.base import Successors
 from mbagent.models.arithmetic import Floats, Floats32, Ints, add_columns, copy_row
+from mbagent.models.base import Successors
 from mbagent.models.kernels import (
     GroupWeights,
     Layout,
@@ -126,7 +126,7 @@ def _causal(
 def _known_input(
     i: int, base: Ints, active: Ints, n_active: int, layout: Layout, group: GroupWeights, columns: Ints, sums: Floats32
 ) -> None:
-    """Writes what factor i's group gets in all particles of a row: from (s, a), and from earlier factors that they share; to ``sums[0]``."""
+    """Writes to ``sums[0]`` what factor i's group gets in all particles of a row: from (s, a), and earlier factors they share."""
     g, n = group.group_of[i], 0
     for j in range(i):
         if base[j] >= 0 and (layout.outputs[j] != 2 or base[j] == 1):
