@@ -93,7 +93,7 @@ def add_rows(table: Floats32, rows: Ints, n_rows: int, out: Floats32, row: int) 
 
 @vectorised
 def add_products(values: Floats32, n_rows: int, n_values: int, weights: Floats32, out: Floats32) -> None:
-    """Adds ``weights`` [4 * m, H] times the first ``n_values`` of ``values`` [R, H] to the first ``n_rows`` of ``out`` [R, 4 * m].
+    """Adds ``weights`` [4 * m, H] times the first ``n_values`` of ``values`` [R, H] to ``n_rows`` rows of ``out`` [R, 4 * m].
 
     Four sums at a time: each of ``values`` is read a quarter as often. All rows one after another with the same weights, while
     these are at hand; what is computed of a row does not depend on that.
