@@ -22,7 +22,23 @@ _T = TypeVar("_T")
 
 def compiled(function: _F) -> _F:
     """Compile a function of numbers and arrays; its uncompiled form stays at ``function.py_func``."""
-    dispatcher = numba.njit(cache=True, nogil=True)(function)
+    return _kept(numba.njit(cache=True, nogil=True)(function), function)
+
+
+def vectorised(function: _F) -> _F:
+    """As ``compiled``, for small loops over arrays of floats: they work on several numbers at once.
+
+    For that, sums may be taken in another order than written, though always in the same one for the same lengths; a product may
+    be added without being rounded first; and nothing is raised when something is divided by zero. Arrays must be known to lie
+    in one piece: those that ``a, b = np.empty((2, n))`` unpacks are not.
+    """
+    return _kept(
+        numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})(function), function
+    )
+
+
+def _kept(dispatcher: Any, function: _F) -> _F:
+    """The dispatcher, with what it keeps on disk marked by the sources that it was made from."""
     kept = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
     if kept is not None and hasattr(
         kept, "_version"

@@ -52,12 +52,18 @@ def _derive_rows(keys: KeyArray, salts: KeyArray, out: KeyArray) -> None:
 
 
 @compiled
+def fill_row(key: np.uint64, out: npt.NDArray[np.float64]) -> None:
+    """Writes the first numbers of ``key`` to ``out``, several at once; for compiled code."""
+    start = mix(key)
+    for index in range(out.shape[0]):
+        word = mix(start + (np.uint64(index) + _ONE) * _GAMMA)
+        out[index] = float(word >> np.uint64(11)) * _TO_UNIT
+
+
+@compiled
 def _fill_uniforms(keys: KeyArray, out: npt.NDArray[np.float64]) -> None:
     for row in range(out.shape[0]):
-        start = mix(keys[row])
-        for index in range(out.shape[1]):
-            word = mix(start + (np.uint64(index) + _ONE) * _GAMMA)
-            out[row, index] = float(word >> np.uint64(11)) * _TO_UNIT
+        fill_row(keys[row], out[row])
 
 
 def as_keys(keys: npt.ArrayLike) -> KeyArray:

@@ -20,7 +20,8 @@ class NeuralConfig:
             independent given state and action).
         group_size: hidden nodes in each of the conditioner's groups.
         correction: whether the conditioner's output is added to the predictor's logits.
-        certain: a factor whose likeliest value has this probability in the predictor's eyes is left to the predictor.
+        certain: a factor whose likeliest value has this probability in the predictor's eyes is left to the predictor; in sweeps
+            the conditioner is asked about it only where the number drawn could matter (``sweep_blocks.LEEWAY``).
         dropout: share of hidden nodes zeroed in each training step; without it, networks learn the noise of rare
             states. None: 0.4, or 0 where the state is a single factor: its columns show nothing that states have in
             common, the network is a table then, and dropout only blurs it.

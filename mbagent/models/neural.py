@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from mbagent.models.arithmetic import Floats32, probabilities
 from mbagent.models.base import (
     LARGEST_NUMBER,
     Actions,
@@ -24,7 +25,7 @@ from mbagent.models.base import (
     as_keys,
 )
 from mbagent.models.config import NeuralConfig
-from mbagent.models.kernels import Floats32, GroupWeights, probabilities
+from mbagent.models.kernels import GroupWeights
 from mbagent.models.networks import Conditioner, DensePredictor, FactorCodec
 from mbagent.models.packing import CompiledBody, compiled_body, pack_groups, pack_layout
 from mbagent.models.samplers import log_prob_causal, sample_causal, sample_independent

@@ -9,15 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mbagent.models.arithmetic import ACTIVATION_CODES, Floats32
 from mbagent.models.base import Actions, States
-from mbagent.models.kernels import (
-    ACTIVATION_CODES,
-    DenseWeights,
-    Floats32,
-    GroupWeights,
-    Layout,
-    dense_logits,
-)
+from mbagent.models.kernels import DenseWeights, GroupWeights, Layout, dense_logits
 from mbagent.models.networks import Affine, Conditioner, DensePredictor, FactorCodec
 from mbagent.models.plane_kernels import pack_planes, plane_logits
 from mbagent.models.planes import PlanePredictor
@@ -28,6 +22,10 @@ CompiledBody: TypeAlias = Callable[[States, Actions], Floats32]
 CHUNK = 64
 """Rows that other torch bodies are evaluated on at once, always this many: matrix products round differently in
 other sizes."""
+
+
+LANES = 16
+"""Hidden layers are as wide as a multiple of this: what the processor adds at once. The rest is zero and leads nowhere."""
 
 
 def compiled_body(predictor: nn.Module, layout: Layout) -> CompiledBody:
@@ -63,59 +61,72 @@ def pack_layout(codec: FactorCodec) -> Layout:
 
 
 def pack_dense(predictor: DensePredictor) -> DenseWeights:
-    """A dense predictor's weights, padded to its widest hidden layer."""
+    """A dense predictor's weights, padded to its widest hidden layer and to ``LANES``."""
     codec = predictor.codec
     layers = [layer for layer in predictor.layers if isinstance(layer, Affine)]
-    sizes = np.asarray([len(layer.bias) for layer in layers], dtype=np.int64)
-    depth, width = len(sizes), int(sizes.max(initial=1))
+    sizes = [len(layer.bias) for layer in layers]
+    depth, width, n_columns = len(sizes), _padded(max(sizes, default=1), LANES), _padded(codec.n_columns, 4)
     inner = np.zeros((max(depth - 1, 0), width, width), dtype=np.float32)
     bias = np.zeros((depth, width), dtype=np.float32)
     for level, layer in enumerate(layers):
         bias[level, : sizes[level]] = _array(layer.bias)
         if level:
-            inner[level - 1, : sizes[level - 1], : sizes[level]] = _array(layer.weight).T
-    out = _array(predictor.out.weight).T
-    first, last = out, np.zeros((width, out.shape[1]), dtype=np.float32)
+            inner[level - 1, : sizes[level], : sizes[level - 1]] = _array(layer.weight)
+    first = np.zeros((codec.n_inputs, width if depth else n_columns), dtype=np.float32)
+    start = _array(layers[0].weight if depth else predictor.out.weight)
+    first[:, : len(start)] = start.T
+    to_columns, column_bias = np.zeros((n_columns, width), dtype=np.float32), np.zeros(n_columns, dtype=np.float32)
     if depth:
-        first = np.zeros((codec.n_inputs, width), dtype=np.float32)
-        first[:, : sizes[0]] = _array(layers[0].weight).T
-        last[: sizes[-1]] = out
+        to_columns[: codec.n_columns, : sizes[-1]] = _array(predictor.out.weight)
+    column_bias[: codec.n_columns] = _array(predictor.out.bias)
     stay = np.zeros((codec.n_actions * codec.n_steps, codec.n_state_columns), dtype=np.float32)
     if predictor.stay is not None:
         stay += _array(predictor.stay)
     return DenseWeights(
-        np.ascontiguousarray(first),
+        first,
         inner,
         bias,
-        sizes,
-        last,
-        _array(predictor.out.bias),
+        np.asarray([_padded(size, LANES) for size in sizes], dtype=np.int64),
+        to_columns,
+        column_bias,
         stay,
+        codec.n_columns,
         ACTIVATION_CODES[predictor.activation],
     )
+
+
+def _padded(size: int, multiple: int) -> int:
+    return -(-size // multiple) * multiple
 
 
 def pack_groups(conditioner: Conditioner) -> GroupWeights:
     """A conditioner's weights, group by group."""
     codec, size = conditioner.codec, conditioner.group_size
-    n_groups, mask = len(conditioner.members), conditioner.groups.mask
+    n_groups, mask, members = len(conditioner.members), conditioner.groups.mask, conditioner.members.numpy()
     index = np.full(len(codec.outputs), -1, dtype=np.int64)
-    index[conditioner.members.numpy()] = np.arange(n_groups)
-    weight = conditioner.groups.weight if mask is None else conditioner.groups.weight * mask
+    index[members] = np.arange(n_groups)
+    weight = _array(conditioner.groups.weight if mask is None else conditioner.groups.weight * mask)
     n_columns = codec.n_inputs + codec.n_columns
-    columns = np.ascontiguousarray(_array(weight).reshape(n_groups, size, n_columns).transpose(0, 2, 1))
-    readout = np.zeros((n_groups, size, codec.width), dtype=np.float32)
+    columns = weight.reshape(n_groups, size, n_columns).transpose(0, 2, 1)
+    of_state = slice(0, codec.n_state_columns)
+    both = columns[:, of_state] + columns[:, codec.n_inputs :][:, of_state]
+    to_values = np.zeros((n_groups, codec.width, size), dtype=np.float32)
     offset = np.zeros((n_groups, codec.width), dtype=np.float32)
     used = slice(1, 2) if codec.all_binary else slice(None)  # the logit of a bit's value 0 is 0
-    readout[:, :, used] = _array(conditioner.readout)
+    to_values[:, used] = _array(conditioner.readout).transpose(0, 2, 1)
     offset[:, used] = _array(conditioner.offset)[:, 0]
+    bits = np.asarray(codec.outputs)[members] == 2
+    for table in (to_values, offset):
+        table[bits, 1] -= table[bits, 0]
+        table[bits, 0] = 0.0
     return GroupWeights(
         index,
-        np.ascontiguousarray(columns[:, : codec.n_inputs]),
-        np.ascontiguousarray(columns[:, codec.n_inputs :]),
+        np.ascontiguousarray(np.concatenate([columns, both], axis=1)),
         np.ascontiguousarray(_array(conditioner.groups.bias).reshape(n_groups, size)),
-        readout,
+        to_values,
         offset,
+        codec.n_inputs,
+        n_columns,
         ACTIVATION_CODES[conditioner.activation],
         conditioner.correction,
     )

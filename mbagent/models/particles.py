@@ -8,8 +8,9 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from mbagent.models.arithmetic import Floats, Ints
 from mbagent.models.base import Bools, Successors
-from mbagent.models.kernels import Floats, Ints, largest
+from mbagent.models.kernels import largest
 from mbagent.models.samplers import draw
 from mbagent_envs._compiled import compiled
 from mbagent_envs.random_keys import derive, derive_one, uniform_at, uniforms

@@ -97,7 +97,7 @@ def plane_logits(states: Ints, actions: Ints, w: PlaneWeights, width: int) -> Fl
     padded = np.zeros((height + 2) * (columns + 2) * hidden, dtype=np.float32)
     patches = np.zeros((cells, 9 * hidden), dtype=np.float32)
     above, read = np.empty((cells, hidden), dtype=np.float32), np.empty((cells, len(w.out_bias)), dtype=np.float32)
-    top, bias = np.empty((2, hidden), dtype=np.float32)
+    top, bias = np.empty(hidden, dtype=np.float32), np.empty(hidden, dtype=np.float32)
     out_bias = np.empty(len(w.out_bias), dtype=np.float32)
     for b in range(n_rows):
         if b == 0 or not _same(states, b):

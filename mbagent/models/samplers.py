@@ -13,20 +13,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent.models.arithmetic import Floats, Floats32, Ints, add_columns, copy_row
 from mbagent.models.kernels import (
-    Floats,
-    Floats32,
     GroupWeights,
-    Ints,
     Layout,
     active_columns,
-    add_columns,
+    add_next,
     finish,
     largest,
+    next_place,
     trusted,
 )
-from mbagent_envs._compiled import borrowed, compiled
-from mbagent_envs.random_keys import uniform_at
+from mbagent_envs._compiled import borrowed, compiled, inlined
+from mbagent_envs.random_keys import fill_row, uniform_at
 
 Keys = NDArray[np.uint64]
 
@@ -35,24 +34,16 @@ class Work(NamedTuple):
     """Work space for one row.
 
     Attributes:
-        active: input columns that are 1, int64 [O + n_steps].
-        shown: columns of the next factors that are not 0, int64 [n_columns].
-        chosen: factors that are not left to the predictor, int64 [O].
-        guess: the next factors' columns, [n_columns].
+        columns: those that are on, int64 [2 * O + n_steps].
         luck: a number for each factor, [O].
-        known: what each factor's group gets from state and action, [O, G].
-        hidden: of one group, [G].
+        sums: input of one group, [1, G].
         row_logits: of one factor, [K].
         given: its distribution, [K].
     """
 
-    active: Ints
-    shown: Ints
-    chosen: Ints
-    guess: Floats32
+    columns: Ints
     luck: Floats
-    known: Floats32
-    hidden: Floats32
+    sums: Floats32
     row_logits: Floats32
     given: Floats
 
@@ -60,21 +51,17 @@ class Work(NamedTuple):
 @compiled
 def work_space(layout: Layout, group: GroupWeights) -> Work:
     """Room for one row of a model of this shape."""
-    n_outputs, n_columns, size, n_values = len(layout.outputs), group.others.shape[1], group.bias.shape[1], group.offset.shape[1]
+    n_outputs, size, n_values = len(layout.outputs), group.bias.shape[1], group.offset.shape[1]
     return Work(
-        np.empty(n_outputs + layout.n_steps, dtype=np.int64),
-        np.empty(n_columns, dtype=np.int64),
-        np.empty(n_outputs, dtype=np.int64),
-        np.empty(n_columns, dtype=np.float32),
+        np.empty(2 * n_outputs + layout.n_steps, dtype=np.int64),
         np.empty(n_outputs, dtype=np.float64),
-        np.empty((n_outputs, size), dtype=np.float32),
-        np.empty(size, dtype=np.float32),
+        np.empty((1, size), dtype=np.float32),
         np.empty(n_values, dtype=np.float32),
         np.empty(n_values, dtype=np.float64),
     )
 
 
-@compiled
+@inlined
 def draw(values: Floats, n: int, u: float) -> int:
     """Index drawn from the first ``n`` values, which sum to one: the inverse of their running sum at ``u`` in [0, 1)."""
     chosen = 0
@@ -87,7 +74,7 @@ def draw(values: Floats, n: int, u: float) -> int:
     return chosen
 
 
-@compiled
+@inlined
 def draw_at(probs: Floats, b: int, i: int, n: int, u: float) -> int:
     """As ``draw``, from ``probs[b, i]``."""
     chosen = 0
@@ -100,7 +87,7 @@ def draw_at(probs: Floats, b: int, i: int, n: int, u: float) -> int:
     return chosen
 
 
-@compiled
+@inlined
 def _likeliest(values: Floats, n: int) -> int:
     """Index of the largest of the first ``n`` values; the lowest of equals."""
     best = 0
@@ -108,13 +95,6 @@ def _likeliest(values: Floats, n: int) -> int:
         if values[k] > values[best]:
             best = k
     return best
-
-
-@compiled
-def copy_row(table: Floats32, row: int, out: Floats32) -> None:
-    """Copies ``table[row]`` to ``out``, without the slice."""
-    for h in range(len(out)):
-        out[h] = table[row, h]
 
 
 @compiled
@@ -186,25 +166,30 @@ def _causal_row(
     # The caller keeps all of this alive: no references need be counted for every factor.
     states, logits, probs, factors = borrowed(states), borrowed(logits), borrowed(probs), borrowed(factors)
     layout, group, w = borrowed(layout), borrowed(group), borrowed(work)
-    n_active, n_shown = active_columns(states, b, action, layout, w.active), 0
+    fill_row(key, w.luck)
+    n_columns, place = active_columns(states, b, action, layout, w.columns), 0
     for i in range(len(layout.outputs)):
-        n, u = layout.outputs[i], uniform_at(key, i)
+        n, u = layout.outputs[i], w.luck[i]
         if trusted(probs, b, i, layout, group, certain):
             if n == 2:  # written out, as in sample_independent
                 value = int((0.5 if greedy else u) >= probs[b, i, 0] and probs[b, i, 1] > 0.0)
             else:
                 value = largest(probs, b, i, n) if greedy else draw_at(probs, b, i, n, u)
         else:
-            g = group.group_of[i]
-            copy_row(group.bias, g, w.hidden)
-            add_columns(group.inputs, g, w.active, n_active, w.hidden)
-            add_columns(group.others, g, w.shown, n_shown, w.hidden)
-            finish(b, i, logits, layout, group, w.hidden, w.row_logits, w.given)
+            _condition(b, i, logits, layout, group, n_columns, w)
             value = _likeliest(w.given, n) if greedy else draw(w.given, n, u)
         factors[b, i] = value
-        if n != 2 or value == 1:  # a bit that is 0 has no column
-            w.shown[n_shown] = layout.start[i] + (0 if n == 2 else value)
-            n_shown += 1
+        n_columns = add_next(states, b, i, value, layout, group, w.columns, n_columns, place)
+        place = next_place(states, b, i, layout, place)
+
+
+@inlined
+def _condition(b: int, i: int, logits: Floats32, layout: Layout, group: GroupWeights, n_columns: int, w: Work) -> None:
+    """Writes factor i's distribution, given the columns that are on, to ``w.given``."""
+    g = group.group_of[i]
+    copy_row(group.bias, g, w.sums, 0)
+    add_columns(group.columns, g, w.columns, n_columns, w.sums, 0)
+    finish(b, i, logits, layout, group, w.sums, 0, w.sums, w.row_logits, w.given)
 
 
 @compiled
@@ -219,27 +204,16 @@ def log_prob_causal(
     certain: float,
 ) -> Floats:
     """Log-probability [B] of the outcomes ``factors`` [B, O] under exactly what ``sample_causal`` draws."""
-    n_outputs = len(layout.outputs)
-    result = np.zeros(len(states), dtype=np.float64)
-    active, shown = np.empty(n_outputs + layout.n_steps, dtype=np.int64), np.empty(n_outputs, dtype=np.int64)
-    hidden = np.empty(group.bias.shape[1], dtype=np.float32)
-    row_logits = np.empty(logits.shape[2], dtype=np.float32)
-    given = np.empty(logits.shape[2], dtype=np.float64)
+    result, work = np.zeros(len(states), dtype=np.float64), work_space(layout, group)
     for b in range(len(states)):
-        n_active = active_columns(states, b, actions[b], layout, active)
-        n_shown = 0
-        for i in range(n_outputs):
-            n, value = layout.outputs[i], factors[b, i]
+        n_columns, place = active_columns(states, b, actions[b], layout, work.columns), 0
+        for i in range(len(layout.outputs)):
+            value = factors[b, i]
             probability = probs[b, i, value]
-            if group.group_of[i] >= 0 and not trusted(probs, b, i, layout, group, certain):
-                g = group.group_of[i]
-                hidden[:] = group.bias[g]
-                add_columns(group.inputs, g, active, n_active, hidden)
-                add_columns(group.others, g, shown, n_shown, hidden)
-                finish(b, i, logits, layout, group, hidden, row_logits, given)
-                probability = given[value]
+            if not trusted(probs, b, i, layout, group, certain):
+                _condition(b, i, logits, layout, group, n_columns, work)
+                probability = work.given[value]
             result[b] += math.log(probability) if probability > 0.0 else -np.inf
-            if n != 2 or value == 1:  # a bit that is 0 has no column
-                shown[n_shown] = layout.start[i] + (0 if n == 2 else value)
-                n_shown += 1
+            n_columns = add_next(states, b, i, value, layout, group, work.columns, n_columns, place)
+            place = next_place(states, b, i, layout, place)
     return result

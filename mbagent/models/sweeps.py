@@ -4,73 +4,30 @@ from __future__ import annotations
 
 import numpy as np
 
-from mbagent.models.kernels import (
-    Floats,
-    Floats32,
-    GroupWeights,
-    Ints,
-    Layout,
-    active_columns,
-    add_columns,
-    add_weighted,
-    finish,
-    trusted,
-)
-from mbagent.models.samplers import Keys, Work, copy_row, draw, draw_at, work_space
-from mbagent_envs._compiled import borrowed, compiled
-from mbagent_envs.random_keys import derive_one, uniform_at
+from mbagent.models.arithmetic import Floats, Floats32, Ints, add_scaled, count_below
+from mbagent.models.kernels import GroupWeights, Layout, finish
+from mbagent.models.samplers import Keys, draw
+from mbagent.models.sweep_blocks import Block, SweepWork, begin_block, list_columns, sum_columns, sum_up, work_space
+from mbagent_envs._compiled import borrowed, compiled, inlined
+from mbagent_envs.random_keys import derive_one, fill_row
 
 _ORDER = np.uint64(1 << 32)
 """Salt of a sweep's random order; its draws use the numbers of the factors, which are smaller."""
 
 
-@compiled
-def _shuffle(factors: Ints, n: int, key: np.uint64, luck: Floats) -> None:
-    """Puts the first ``n`` of ``factors`` into a random order; ``luck`` is work space for a number a factor.
+@inlined
+def _shuffle(n: int, key: np.uint64, w: SweepWork) -> None:
+    """Lists the first ``n`` of ``w.chosen`` in a random order, in ``w.order``.
 
-    Any two come in the same order whichever others are there: sweeps over some of the factors are like those over all.
+    Any two come in the same order whichever others are there: sweeps over some of the factors are like those over all. Each one's
+    place is how many come before it, counted without branches: those of a sort could not be foretold.
     """
+    fill_row(key, w.rank)
     for step in range(n):
-        factor = factors[step]
-        u = luck[factor] = uniform_at(key, factor)
-        place = step
-        while place > 0 and luck[factors[place - 1]] > u:
-            factors[place] = factors[place - 1]
-            place -= 1
-        factors[place] = factor
-
-
-@compiled
-def _show(guess: Floats32, i: int, value: int, layout: Layout) -> None:
-    """Writes factor i's value to the columns that the conditioner sees."""
-    if layout.outputs[i] == 2:
-        guess[layout.start[i]] = float(value)
-        return
-    for k in range(layout.outputs[i]):
-        guess[layout.start[i] + k] = 1.0 if k == value else 0.0
-
-
-@compiled
-def _show_real(guess: Floats32, b: int, i: int, probs: Floats, layout: Layout) -> None:
-    """Writes the probabilities of factor i's values to the columns that the conditioner sees."""
-    if layout.outputs[i] == 2:
-        guess[layout.start[i]] = probs[b, i, 1]
-        return
-    for k in range(layout.outputs[i]):
-        guess[layout.start[i] + k] = probs[b, i, k]
-
-
-@compiled
-def _add_guess(table: Floats32, g: int, guess: Floats32, shown: Ints, hidden: Floats32) -> None:
-    """Adds to ``hidden`` [G] what group g gets from the guess [n_columns]; ``table`` is [g, n_columns, G].
-
-    ``shown`` [n_columns] is work space: the columns that are not 0, listed without a branch, since bits cannot be foretold.
-    """
-    n = 0
-    for column in range(len(guess)):
-        shown[n] = column
-        n += guess[column] != 0.0
-    add_weighted(table, g, shown, n, guess, hidden)
+        w.ranks[step] = w.rank[w.chosen[step]]
+    for step in range(n):
+        place = count_below(w.ranks, 0, step, w.ranks[step], True) + count_below(w.ranks, step + 1, n, w.ranks[step], False)
+        w.order[place] = w.chosen[step]
 
 
 @compiled
@@ -96,7 +53,9 @@ def sample_sweeps(
         keys: uint64 [B].
         layout: the factors.
         group: the conditioner, masked "others".
-        certain: factors are left to the predictor as in ``sample_causal``: drawn once, then left alone.
+        certain: a factor whose likeliest value has this probability in the predictor's eyes takes that value in every sweep,
+            without the conditioner, unless the number drawn for it lies so far out that the conditioner could say otherwise
+            by raising the odds ``LEEWAY`` times. Where it never raises them more, the draws are those of the full sweep.
         sweeps: passes; each in a random order of its own.
         real_guess: the first guess is the predictor's probabilities; else bits drawn from them.
 
@@ -104,53 +63,80 @@ def sample_sweeps(
         Draws int64 [B, O].
     """
     factors = np.empty((len(states), len(layout.outputs)), dtype=np.int64)
-    work = work_space(layout, group)
-    for b in range(len(states)):
-        _sweep_row(b, states, actions[b], logits, probs, keys[b], layout, group, certain, sweeps, real_guess, work, factors)
+    block, work = work_space(len(states), layout, group)
+    first = 0
+    while first < len(states):
+        n_rows = begin_block(first, states, actions, probs, keys, layout, group, certain, real_guess, block, work, factors)
+        sum_up(n_rows, layout, group, real_guess, block)
+        for r in range(n_rows):
+            b = first + r
+            _sweep_row(b, r, states, actions[b], logits, keys[b], layout, group, sweeps, real_guess, block, work, factors)
+        first += n_rows
     return factors
 
 
 @compiled
 def _sweep_row(
     b: int,
+    r: int,
     states: Ints,
     action: int,
     logits: Floats32,
-    probs: Floats,
     row_key: np.uint64,
     layout: Layout,
     group: GroupWeights,
-    certain: float,
     sweeps: int,
     real_guess: bool,
-    work: Work,
+    block: Block,
+    work: SweepWork,
     factors: Ints,
 ) -> None:
-    """Row b of ``sample_sweeps``, to ``factors`` [B, O]."""
-    # The caller keeps all of this alive: no references need be counted for every factor.
-    states, logits, probs, factors = borrowed(states), borrowed(logits), borrowed(probs), borrowed(factors)
-    layout, group, w = borrowed(layout), borrowed(group), borrowed(work)
-    n_active, n_open = active_columns(states, b, action, layout, w.active), 0
-    for i in range(len(layout.outputs)):
-        factors[b, i] = draw_at(probs, b, i, layout.outputs[i], uniform_at(row_key, i))
-        _show(w.guess, i, factors[b, i], layout)
-        if not trusted(probs, b, i, layout, group, certain):
-            if real_guess:
-                _show_real(w.guess, b, i, probs, layout)
-            g = group.group_of[i]
-            copy_row(group.bias, g, w.hidden)
-            add_columns(group.inputs, g, w.active, n_active, w.hidden)
-            for h in range(len(w.hidden)):
-                w.known[i, h] = w.hidden[h]
-            w.chosen[n_open] = i
-            n_open += 1
+    """The sweeps of row b, r of its block, to ``factors`` [B, O]."""
+    states, logits, factors = borrowed(states), borrowed(logits), borrowed(factors)
+    layout, group, k, w = borrowed(layout), borrowed(group), borrowed(block), borrowed(work)
     for sweep in range(sweeps):
-        key = derive_one(row_key, np.uint64(sweep))
-        _shuffle(w.chosen, n_open, derive_one(key, _ORDER), w.luck)
-        for step in range(n_open):
-            i = w.chosen[step]
-            copy_row(w.known, i, w.hidden)
-            _add_guess(group.others, group.group_of[i], w.guess, w.shown, w.hidden)
-            finish(b, i, logits, layout, group, w.hidden, w.row_logits, w.given)
-            factors[b, i] = draw(w.given, layout.outputs[i], uniform_at(key, i))
-            _show(w.guess, i, factors[b, i], layout)
+        key, anew = derive_one(row_key, np.uint64(sweep)), real_guess and sweep == 0
+        fill_row(key, w.luck)
+        n = _choose(b, r, k, w, factors)
+        _shuffle(n, derive_one(key, _ORDER), w)
+        for step in range(n):
+            i = w.order[step]
+            u, value, slot = w.luck[i], k.top[r, i], k.slot[r, i]
+            if u < k.low[r, i] or u >= k.high[r, i]:
+                if slot < 0:
+                    slot = len(k.sums) - 1
+                    n_columns = list_columns(b, r, states, action, layout, k, w, w.columns)
+                    sum_columns(i, r, w.columns, n_columns, group, anew, k, slot)
+                finish(b, i, logits, layout, group, k.sums, slot, w.hidden, w.row_logits, w.given)
+                value = draw(w.given, layout.outputs[i], u)
+            if value != factors[b, i] or anew:
+                factors[b, i] = value
+                _change(r, i, value, step + 1 if sweep == sweeps - 1 else 0, n, layout, group, k, w)
+
+
+@inlined
+def _choose(b: int, r: int, k: Block, w: SweepWork, factors: Ints) -> int:
+    """Writes the factors that this sweep may change to ``w.chosen``; returns how many."""
+    n = 0
+    for i in range(len(w.luck)):
+        w.chosen[n] = i
+        n += int((w.luck[i] < k.low[r, i]) | (w.luck[i] >= k.high[r, i]) | (factors[b, i] != k.top[r, i]))
+    return n
+
+
+@inlined
+def _change(
+    r: int, i: int, value: int, begin: int, end: int, layout: Layout, group: GroupWeights, k: Block, w: SweepWork
+) -> None:
+    """Writes factor i's value to its columns, and what that changes to the sums of the open factors from ``begin`` on."""
+    n = layout.outputs[i]
+    for v in range(1 if n == 2 else 0, n):
+        column = layout.start[i] + (0 if n == 2 else v)
+        difference = np.float32(int(value == v)) - k.guess[r, column]
+        k.guess[r, column] = float(int(value == v))
+        if difference != 0.0:
+            for step in range(begin, end):
+                slot = k.slot[r, w.order[step]]
+                if slot >= 0:
+                    g = group.group_of[w.order[step]]
+                    add_scaled(group.columns, g, group.next_start + column, difference, k.sums, slot)

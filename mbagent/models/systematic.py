@@ -17,15 +17,12 @@ from typing import TypeAlias
 
 import numpy as np
 
+from mbagent.models.arithmetic import Floats, Floats32, Ints, add_columns, copy_row
 from mbagent.models.base import Successors
 from mbagent.models.kernels import (
-    Floats,
-    Floats32,
     GroupWeights,
-    Ints,
     Layout,
     active_columns,
-    add_columns,
     finish,
     trusted,
 )
@@ -94,8 +91,8 @@ def _causal(
     p, found = new_particles(n_grid, n_outputs), room(len(states), n_grid, n_outputs)
     base, still_open, columns = np.empty((3, n_outputs), dtype=np.int64)
     active = np.empty(n_outputs + layout.n_steps, dtype=np.int64)
-    known, hidden = np.empty((2, group.bias.shape[1]), dtype=np.float32)
-    row_logits = np.empty(probs.shape[2], dtype=np.float32)
+    sums = np.empty((2, group.bias.shape[1]), dtype=np.float32)  # of what all particles share; of one particle
+    row_logits, hidden = np.empty(probs.shape[2], dtype=np.float32), np.empty((1, group.bias.shape[1]), dtype=np.float32)
     values, total = np.empty(probs.shape[2], dtype=np.float64), 0
     for b in range(len(states)):
         n_active = active_columns(states, b, actions[b], layout, active)
@@ -107,15 +104,15 @@ def _causal(
                 continue
             base[i], still_open[n_open] = -1, i
             if not trust:
-                _known_input(i, base, active, n_active, layout, group, columns, known)
+                _known_input(i, base, active, n_active, layout, group, columns, sums)
             for q in range(n_live):
                 if trust:
                     values[:] = probs[b, i]
                 else:
-                    hidden[:] = known
-                    n_columns = _open_columns(p.factors, q, still_open, n_open, layout, columns)
-                    add_columns(group.others, group.group_of[i], columns, n_columns, hidden)
-                    finish(b, i, logits, layout, group, hidden, row_logits, values)
+                    copy_row(sums, 0, sums, 1)
+                    n_columns = _open_columns(p.factors, q, still_open, n_open, layout, group, columns)
+                    add_columns(group.columns, group.group_of[i], columns, n_columns, sums, 1)
+                    finish(b, i, logits, layout, group, sums, 1, hidden, row_logits, values)
                 prune(values, n)
                 n_live = split(p, q, n_live, i, n_open, values, n, n_grid, key, offset)
             n_open += 1
@@ -127,27 +124,29 @@ def _causal(
 
 @compiled
 def _known_input(
-    i: int, base: Ints, active: Ints, n_active: int, layout: Layout, group: GroupWeights, columns: Ints, known: Floats32
+    i: int, base: Ints, active: Ints, n_active: int, layout: Layout, group: GroupWeights, columns: Ints, sums: Floats32
 ) -> None:
-    """Writes what factor i's group gets in all particles of a row: from (s, a), and from earlier factors that they share."""
+    """Writes to ``sums[0]`` what factor i's group gets in all particles of a row: from (s, a), and earlier factors they share."""
     g, n = group.group_of[i], 0
     for j in range(i):
         if base[j] >= 0 and (layout.outputs[j] != 2 or base[j] == 1):
-            columns[n] = layout.start[j] + (0 if layout.outputs[j] == 2 else base[j])
+            columns[n] = group.next_start + layout.start[j] + (0 if layout.outputs[j] == 2 else base[j])
             n += 1
-    known[:] = group.bias[g]
-    add_columns(group.inputs, g, active, n_active, known)
-    add_columns(group.others, g, columns, n, known)
+    copy_row(group.bias, g, sums, 0)
+    add_columns(group.columns, g, active, n_active, sums, 0)
+    add_columns(group.columns, g, columns, n, sums, 0)
 
 
 @compiled
-def _open_columns(factors: Ints, q: int, still_open: Ints, n_open: int, layout: Layout, columns: Ints) -> int:
+def _open_columns(
+    factors: Ints, q: int, still_open: Ints, n_open: int, layout: Layout, group: GroupWeights, columns: Ints
+) -> int:
     """Writes the columns that are 1 by the open factors of particle ``q``; returns how many."""
     n = 0
     for w in range(n_open):
         j, value = still_open[w], factors[q, w]
         if layout.outputs[j] != 2 or value == 1:
-            columns[n] = layout.start[j] + (0 if layout.outputs[j] == 2 else value)
+            columns[n] = group.next_start + layout.start[j] + (0 if layout.outputs[j] == 2 else value)
             n += 1
     return n
 

@@ -42,9 +42,12 @@ NOTES = {
     "chance is a simulation of its own in Stochastic MuZero.",
     "naive": "Microseconds of processor time for one state. Naive: a full forward pass of predictor and conditioner in torch for "
     "every variable. bar: the ratio asked for.",
-    "short cut": "Full: all variables redrawn in every sweep; short: those only to which the predictor gives between 2% and 98%. "
-    "Total variation between the two, mean over inputs: of the joint distribution (estimated from finitely many draws, so too "
-    "high), and of pairs of variables. same_luck bounds it from above.",
+    "short cut": "Full: all variables redrawn in every sweep; short: those to which the predictor gives between 2% and 98%, and "
+    "of the others those whose random number lies so far out that the conditioner could matter. begun: what both begin with. "
+    "uncertain: variables between 2% and 98%; (d + 1) / uncertain is the most that could be saved. Total variation between "
+    "the two is at most same_luck, the share of whole next states that differ under the same random numbers; bound: its 95% "
+    "limit. joint and pairs: estimates from frequencies with other random numbers; floor: the same estimate for two runs of the "
+    "full sweep, whose total variation is 0. Means over inputs.",
     "networks": "GeyserRunner with 30 bits, learned; the same predictor and causal conditioner, sampled in every simulation.",
 }
 """What each table's figures mean."""

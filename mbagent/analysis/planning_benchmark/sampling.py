@@ -10,6 +10,7 @@ from functools import partial
 
 import numpy as np
 import torch
+from scipy import stats
 
 from mbagent.analysis.planning_benchmark.noise import random_inputs
 from mbagent.analysis.planning_benchmark.worlds import Floats, Ints
@@ -62,16 +63,21 @@ class ShortCut:
     Attributes:
         d: number of bits.
         sweeps: passes over the variables.
-        uncertain: variables that the predictor leaves open, mean over inputs.
+        uncertain: variables that the predictor leaves open, mean over inputs. With everything else for nothing, the short cut
+            could be at most variables / uncertain times as fast.
         full: microseconds of processor time for one sampled state.
         short: the same.
-        ratio: of the two.
+        begun: the same for what both begin with: predictor, first guess, and the first sums of the uncertain variables.
+        ratio: of full and short.
         bar: what was asked for.
-        joint: total variation of the joint distributions of the whole next state; its estimate from finitely many draws
-            errs upwards.
-        pairs: total variation of the joint distribution of two variables, mean over all pairs.
-        worst_pair: the same, for the pair that differs most.
-        same_luck: share of draws that differ under the same random numbers: an upper bound of the joint total variation.
+        same_luck: share of draws that differ under the same random numbers. Two variables differ with at least the probability
+            that is their laws' total variation, however they are coupled: so this is an upper bound of the total variation
+            of the whole next state, without any noise that would add to it.
+        bound: 95% confidence limit of ``same_luck`` from finitely many draws.
+        joint: total variation estimated from frequencies, of the short cut and the full sweep with other random numbers.
+        floor: the same estimate from two runs of the full sweep, whose total variation is 0: what luck alone adds.
+        pairs: as ``joint``, of two variables, mean over all pairs.
+        pairs_floor: as ``floor``, of pairs.
     """
 
     d: int
@@ -79,12 +85,15 @@ class ShortCut:
     uncertain: float
     full: float
     short: float
+    begun: float
     ratio: float
     bar: float
-    joint: float
-    pairs: float
-    worst_pair: float
     same_luck: float
+    bound: float
+    joint: float
+    floor: float
+    pairs: float
+    pairs_floor: float
 
 
 @torch.inference_mode()
@@ -185,23 +194,38 @@ def compare_short_cut(model: NeuralTransitionModel, sweeps: int, seed: int, n_in
     states, actions = random_inputs(d, 1024, rng)
     keys = derive(seed, np.arange(len(states)))
     times = []
-    for certain in (EVERYTHING, TRUSTED):
-        with using(model, certain, sweeps):
+    for certain, passes in ((EVERYTHING, sweeps), (TRUSTED, sweeps), (TRUSTED, 0)):
+        with using(model, certain, passes):
             times.append(microseconds(lambda: model.sample(states, actions, keys), len(states)))
     uncertain = (model.probabilities(states, actions).max(axis=2) < TRUSTED).sum(axis=1).mean()
-    found = np.array([_apart(model, sweeps, states[i], actions[i], seed + i, n_draws) for i in range(n_inputs)]).mean(axis=0)
+    apart = np.array([_apart(model, sweeps, states[i], actions[i], seed + i, n_draws) for i in range(n_inputs)]).mean(axis=0)
+    same_luck, joint, floor, pairs, pairs_floor = (float(x) for x in apart)
     ratio, bar = times[0] / times[1], BARS_SHORT_CUT.get(d, np.nan)
-    return ShortCut(d, sweeps, float(uncertain), times[0], times[1], ratio, bar, *(float(x) for x in found))
+    bound = upper_limit(same_luck, n_inputs * n_draws)
+    full, short, begun = times
+    return ShortCut(
+        d, sweeps, float(uncertain), full, short, begun, ratio, bar, same_luck, bound, joint, floor, pairs, pairs_floor
+    )
+
+
+def upper_limit(share: float, n: int) -> float:
+    """The largest probability, to 95% confidence, of what has happened in this share of n trials (Clopper and Pearson 1934)."""
+    hits = round(share * n)
+    return 1.0 if hits >= n else float(stats.beta.ppf(0.95, hits + 1, n - hits))
 
 
 def _apart(model: NeuralTransitionModel, sweeps: int, state: Ints, action: np.int64, seed: int, n: int) -> tuple[float, ...]:
-    """Joint, mean pair and worst pair total variation for one input, and the share of draws that differ."""
+    """For one input: share of draws that differ, joint total variation and its floor, and these two for the mean pair."""
     given = np.tile(state, (n, 1)), np.full(n, action)
-    keys = derive(seed, np.arange(n))
     draws = []
-    for certain in (EVERYTHING, TRUSTED):
+    for certain, run in ((EVERYTHING, 0), (TRUSTED, 0), (EVERYTHING, 1)):
         with using(model, certain, sweeps):
-            # The same random numbers: what differs is then the two procedures, and little of it luck.
-            draws.append(np.column_stack(model.sample(*given, keys)).astype(np.int64))
-    pairs = pair_variations(*draws)
-    return total_variation(*draws), float(pairs.mean()), float(pairs.max()), float((draws[0] != draws[1]).any(axis=1).mean())
+            draws.append(np.column_stack(model.sample(*given, derive(seed, np.arange(n), run))).astype(np.int64))
+    full, short, again = draws
+    return (
+        float((full != short).any(axis=1).mean()),
+        total_variation(again, short),
+        total_variation(again, full),
+        float(pair_variations(again, short).mean()),
+        float(pair_variations(again, full).mean()),
+    )

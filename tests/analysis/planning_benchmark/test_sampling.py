@@ -5,10 +5,12 @@ from mbagent.analysis.planning_benchmark.networks import NetworkTask, exported, 
 from mbagent.analysis.planning_benchmark.noise import PAIRS_REDRAWN, build_sampler, following, random_inputs
 from mbagent.analysis.planning_benchmark.sampling import (
     EVERYTHING,
+    TRUSTED,
     compare_short_cut,
     naive_sample,
     pair_variations,
     total_variation,
+    upper_limit,
     using,
 )
 from mbagent.models.neural import NeuralTransitionModel
@@ -49,7 +51,31 @@ def test_the_short_cut_is_measured_on_equal_terms() -> None:
     before = model.config
     found = compare_short_cut(model, 1, 0, 2, 200)
     assert model.config == before
-    assert 0.0 <= found.pairs <= found.worst_pair <= found.joint <= found.same_luck <= 1.0
+    assert 0.0 <= found.same_luck <= found.bound <= 1.0
+    assert 0.0 <= found.pairs <= found.joint <= 1.0
+    assert 0.0 <= found.pairs_floor <= found.floor <= 1.0
+
+
+def test_the_limit_of_a_share_covers_it_as_often_as_it_says() -> None:
+    shares = np.random.default_rng(0).binomial(200, 0.03, size=2000) / 200
+    covered = np.mean([upper_limit(share, 200) >= 0.03 for share in shares])
+    assert 0.94 < covered <= 1.0
+    assert upper_limit(0.0, 1000) == pytest.approx(3.0 / 1000, rel=0.01)  # the rule of three
+    assert upper_limit(1.0, 10) == 1.0
+
+
+@pytest.mark.parametrize("sweeps", [1, 3])
+def test_the_short_cut_draws_what_the_full_sweep_draws_where_the_conditioner_agrees(sweeps: int) -> None:
+    model = build_sampler("sweeps", 8, 1)  # a conditioner that adds nothing yet
+    weights = {name: array * 4.0 if name == "predictor.stay" else array for name, array in model.state_dict().items()}
+    model.load_state_dict(weights)
+    states, actions = random_inputs(8, 3000, np.random.default_rng(0))
+    assert (model.probabilities(states, actions).max(axis=2) >= TRUSTED).mean() > 0.5
+    draws = []
+    for certain in (EVERYTHING, TRUSTED):
+        with using(model, certain, sweeps):
+            draws.append(np.column_stack(model.sample(states, actions, derive(0, np.arange(3000)))))
+    np.testing.assert_array_equal(draws[0], draws[1])
 
 
 def test_networks_are_exported_with_the_rewards_of_the_game() -> None:
