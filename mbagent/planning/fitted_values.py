@@ -35,11 +35,14 @@ STEPS = 40
 CHANCE = 0.2
 """Share of random actions once there are values to play by."""
 
-SAMPLES = 4
-"""Draws for each (state, action)."""
+FEWEST_SAMPLES, MOST_SAMPLES = 4, 32
+"""Draws for each (state, action), at least and at most."""
 
-SAMPLED_TOGETHER = 64
-"""States that share their luck; many different lucks make values means over it."""
+SAMPLES_IN_ALL = 8000
+"""Draws for each action, about: the fewer states were met, the more for each."""
+
+SAMPLED_TOGETHER = 4
+"""States that share their luck; values are to be means over many lucks."""
 
 SWEEPS = 150
 """Backups and fits in a round, at most."""
@@ -151,8 +154,9 @@ def greedy_actions(task: Task, leaf: LeafValues, states: States, step: int) -> A
 def _expanded(task: Task, graph: StateGraph, leaf: LeafValues, step: int) -> tuple[Indices, Floats, Floats, Floats, Floats]:
     """Expands all nodes of a graph; returns them, the values of what is met, room for new ones and for q, and the rewards."""
     nodes = np.arange(len(graph))
+    samples = min(max(SAMPLES_IN_ALL // len(nodes), FEWEST_SAMPLES), MOST_SAMPLES)
     for begin in range(0, len(nodes), SAMPLED_TOGETHER):
-        graph.expand(nodes[begin : begin + SAMPLED_TOGETHER], SAMPLES, int(derive(task.seed, _EXPAND_SALT, step, begin)[0]))
+        graph.expand(nodes[begin : begin + SAMPLED_TOGETHER], samples, int(derive(task.seed, _EXPAND_SALT, step, begin)[0]))
     v, q = np.zeros(len(graph)), np.zeros((len(graph), task.model.n_actions))
     evaluate(leaf, graph.states, np.zeros(len(graph), dtype=np.bool_), v)
     return nodes, v, np.empty(len(nodes)), q, score_edges(graph, task.goal)
