@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from mbagent.models import causal_bits as causal_bits  # its overloads
 from mbagent.models.base import (
     LARGEST_NUMBER,
     Actions,
@@ -23,10 +24,11 @@ from mbagent.models.base import (
     Successors,
     as_keys,
 )
+from mbagent.models.bit_networks import CausalBits, pack_bits
 from mbagent.models.config import NeuralConfig
 from mbagent.models.kernels import Floats32, GroupWeights, probabilities
 from mbagent.models.networks import Conditioner, DensePredictor, FactorCodec
-from mbagent.models.packing import CompiledBody, compiled_body, pack_groups, pack_layout
+from mbagent.models.packing import CompiledBody, compiled_body, pack_dense, pack_groups, pack_layout
 from mbagent.models.samplers import log_prob_causal, sample_causal, sample_independent
 from mbagent.models.sweeps import sample_sweeps
 from mbagent.models.systematic import causal_successors, independent_successors
@@ -105,6 +107,7 @@ class NeuralTransitionModel(BaseTransitionModel):
     def _changed(self) -> None:
         self._forward: CompiledBody | None = None
         self._groups: GroupWeights | None = None
+        self._kernel: CausalBits | None = None
 
     @one_thread()
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
@@ -257,6 +260,12 @@ class NeuralTransitionModel(BaseTransitionModel):
             n_samples,
             seed,
         )
+
+    def kernel(self) -> CausalBits | None:
+        """The networks for compiled search (see ``compiled_model``); None where ``bit_networks`` does not cover them."""
+        if self._kernel is None and self.config.conditioner == "causal" and isinstance(self.predictor, DensePredictor):
+            self._kernel = pack_bits(pack_dense(self.predictor), self._packed_groups(), self._layout, self.config.certain)
+        return self._kernel
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """See TransitionModel."""
