@@ -32,8 +32,9 @@ def untrained_task() -> NetworkTask:
 def test_the_first_goal_is_the_games_own() -> None:
     game = GeyserRunner(width=WIDTH, hit_cost=HIT_COST)
     states, _ = exact_values(goals_of(0)[0], 0.5)
-    expected = game.reward(states, np.zeros(len(states)), states)
-    np.testing.assert_allclose(goals_of(0)[0](states, np.zeros(len(states)), states), expected)
+    actions = np.zeros(len(states), dtype=np.int64)
+    expected = game.reward(states, actions, states)
+    np.testing.assert_allclose(goals_of(0)[0](states, actions, states), expected)
 
 
 def test_exact_values_are_those_of_a_life_at_one_column() -> None:
