@@ -89,7 +89,8 @@ class RatioRow:
         ours: the library's effort; empty where none loses as little.
         ours_regret, ours_ms: its figures.
         ratio: times less processor time to regret as low.
-        simulations_ratio: times as many simulations a second with the same number of simulations; nan where not measured.
+        simulations_ratio: times as many simulations a second, with as many simulations and no more regret, at most; nan where
+            that was not measured.
     """
 
     roots: int
@@ -170,10 +171,11 @@ def ratios(own: Sequence[NetworkRow], peer: Sequence[NetworkRow]) -> list[RatioR
         for row in peer:
             ms, rate = getattr(row, f"ms_{key}"), getattr(row, f"simulations_{key}")
             good = min((o for o in own if o.regret <= row.regret), key=lambda o: getattr(o, f"ms_{key}"), default=None)
-            rates = [getattr(o, f"simulations_{key}") for o in own if o.simulations == row.simulations]
+            alike = (o for o in own if o.simulations == row.simulations and o.regret <= row.regret)
+            best = max((getattr(o, f"simulations_{key}") for o in alike), default=float("nan"))
             ours = ("", float("nan"), float("nan"), float("nan"))
             if good is not None:
                 cost = getattr(good, f"ms_{key}")
                 ours = (f"{good.search}, {good.simulations} simulations", good.regret, cost, ms / cost)
-            rows.append(RatioRow(key, row.simulations, row.regret, ms, *ours, rates[-1] / rate if rates else float("nan")))
+            rows.append(RatioRow(key, row.simulations, row.regret, ms, *ours, best / rate))
     return rows

@@ -85,4 +85,4 @@ def test_the_cheapest_effort_that_loses_no_more_is_taken() -> None:
     found = ratios(own, [row(MCTX, 16, 0.6, 0.2), row(MCTX, 64, 0.3, 2.0), row(MCTX, 256, 0.05, 9.0)])
     assert [r.ours for r in found[:3]] == ["cheap, 4 simulations", "good, 64 simulations", ""]
     np.testing.assert_allclose([r.ratio for r in found[:3]], [2.0, 4.0, np.nan])
-    np.testing.assert_allclose([r.simulations_ratio for r in found[:3]], [np.nan, 2.0, np.nan])
+    np.testing.assert_allclose([r.simulations_ratio for r in found[:3]], [np.nan, 4.0, np.nan])
