@@ -29,6 +29,7 @@ from rich.table import Table
 from mbagent.analysis.folders import replaced, set_aside
 from mbagent.analysis.planning_benchmark.latency import SETTINGS, steady
 from mbagent.analysis.planning_benchmark.latency import measure as measure_latency
+from mbagent.analysis.planning_benchmark.network_search import EFFORTS, measure_own, ratios, rows_of_mctx
 from mbagent.analysis.planning_benchmark.networks import build_task, run_networks_in_mctx
 from mbagent.analysis.planning_benchmark.noise import Sampler, trained
 from mbagent.analysis.planning_benchmark.page import TITLES, shown, write_page
@@ -127,16 +128,25 @@ def measure_short_cut(args: Args, say: Say) -> dict[str, Rows]:
 
 def measure_networks(args: Args, say: Say) -> dict[str, Rows]:
     """Searches through learned networks."""
+    say("networks: learning the game")
+    task = build_task(args.first_seed)
+    own = []
+    for effort in EFFORTS:
+        say(f"networks: {effort.search}, {effort.simulations} simulations")
+        own.append(measure_own(task, effort))
     if args.peers_python is None:
         say("Networks in mctx are left out: --peers-python is not given.")
-        return {}
+        return {"networks": [asdict(row) for row in own]}
     say("networks: mctx, Gumbel MuZero")
     try:
-        speeds, _ = run_networks_in_mctx(args.peers_python, build_task(args.first_seed))
+        peer = rows_of_mctx(task, run_networks_in_mctx(args.peers_python, task))
     except PeerError as error:
         say(f"Left out: {error}")
-        return {}
-    return {"networks": [{"search": "mctx, Gumbel MuZero", **asdict(speed)} for speed in speeds]}
+        return {"networks": [asdict(row) for row in own]}
+    return {
+        "networks": [asdict(row) for row in (*own, *peer)],
+        "equal regret": [asdict(row) for row in ratios(own, peer)],
+    }
 
 
 _MEASURES: dict[str, Callable[[Args, Say], dict[str, Rows]]] = {

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from mbagent.models import causal_bits as causal_bits  # its overloads
 from mbagent.models.arithmetic import Floats32, probabilities
 from mbagent.models.base import (
     LARGEST_NUMBER,
@@ -24,10 +25,11 @@ from mbagent.models.base import (
     Successors,
     as_keys,
 )
+from mbagent.models.bit_networks import CausalBits, pack_bits
 from mbagent.models.config import NeuralConfig
 from mbagent.models.kernels import GroupWeights
 from mbagent.models.networks import Conditioner, DensePredictor, FactorCodec
-from mbagent.models.packing import CompiledBody, compiled_body, pack_groups, pack_layout
+from mbagent.models.packing import CompiledBody, compiled_body, pack_dense, pack_groups, pack_layout
 from mbagent.models.samplers import log_prob_causal, sample_causal, sample_independent
 from mbagent.models.sweeps import sample_sweeps
 from mbagent.models.systematic import causal_successors, independent_successors
@@ -106,6 +108,7 @@ class NeuralTransitionModel(BaseTransitionModel):
     def _changed(self) -> None:
         self._forward: CompiledBody | None = None
         self._groups: GroupWeights | None = None
+        self._kernel: CausalBits | None = None
 
     @one_thread()
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
@@ -258,6 +261,12 @@ class NeuralTransitionModel(BaseTransitionModel):
             n_samples,
             seed,
         )
+
+    def kernel(self) -> CausalBits | None:
+        """The networks for compiled search (see ``compiled_model``); None where ``bit_networks`` does not cover them."""
+        if self._kernel is None and self.config.conditioner == "causal" and isinstance(self.predictor, DensePredictor):
+            self._kernel = pack_bits(pack_dense(self.predictor), self._packed_groups(), self._layout, self.config.certain)
+        return self._kernel
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """See TransitionModel."""

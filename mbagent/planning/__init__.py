@@ -1,1 +1,1 @@
-"""Planners: Monte Carlo tree search, flat Monte Carlo, and value iteration on the reachable machine."""
+"""Planners: Monte Carlo tree search, two kinds of it, flat Monte Carlo, and value iteration on the reachable machine."""

@@ -49,7 +49,8 @@ def score_edges(graph: StateGraph, goal: Goal, start: int = 0) -> Floats:
     if graph.n_edges == start:
         return np.zeros(0)
     sources, next_nodes = graph.sources[start:], graph.next_nodes[start:]
-    return goal(graph.states[sources], graph.actions[start:], graph.states[next_nodes])
+    states = graph.states  # take: rows three times as fast as by indexing
+    return goal(states.take(sources, axis=0), graph.actions[start:], states.take(next_nodes, axis=0))
 
 
 def solve(graph: StateGraph, goal: Goal, gamma: float, n_groups: int = 1, leaf: LeafValues = LOWEST_KNOWN) -> Values:

@@ -86,10 +86,12 @@ def search(params: Params, key: Any, states: Any, simulations: int) -> Any:
 
 
 def main(path: Path) -> None:
-    """Times the search; prints one JSON text."""
+    """Times the search, and lets it choose actions with each budget; prints one JSON text."""
     with np.load(path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     speeds, repetitions, roots = arrays.pop("speeds"), int(arrays.pop("repetitions")), arrays.pop("roots").astype(np.float32)
+    starts, budgets, seeds = arrays.pop("starts").astype(np.float32), arrays.pop("budgets"), arrays.pop("seeds")
+    goals = {name: arrays.pop(f"{name}_goals") for name in ("linear", "pairs")}
     params = {name: jnp.asarray(x, dtype=jnp.int32 if name == "members" else jnp.float32) for name, x in arrays.items()}
     results = []
     for n_roots, simulations in speeds.tolist():
@@ -111,9 +113,16 @@ def main(path: Path) -> None:
                 "samples_per_second": rate,
             }
         )
+    choices: dict[int, list[Any]] = {}
+    for budget in budgets.tolist():
+        for linear, pairs in zip(goals["linear"], goals["pairs"], strict=True):
+            wanted = {**params, "linear": jnp.asarray(linear, jnp.float32), "pairs": jnp.asarray(pairs, jnp.float32)}
+            some = [search(wanted, jax.random.PRNGKey(seed), jnp.asarray(starts), budget) for seed in seeds]
+            choices.setdefault(budget, []).append([np.asarray(actions).tolist() for actions in some])
     many = jnp.tile(jnp.asarray(roots[:1]), (20_000, 1))
     drawn = jax.jit(sample)(params, jax.random.PRNGKey(7), many, jnp.zeros(len(many), dtype=jnp.int32))
-    json.dump({"speeds": results, "mean_next_state": np.asarray(drawn[:, :-1].mean(axis=0)).tolist()}, sys.stdout)
+    mean = np.asarray(drawn[:, :-1].mean(axis=0)).tolist()
+    json.dump({"speeds": results, "choices": choices, "mean_next_state": mean}, sys.stdout)
 
 
 if __name__ == "__main__":

@@ -28,14 +28,15 @@ class Bulbs(KnownModel):
         raise NotImplementedError
 
     def _on(self, states: States, actions: States) -> Floats:
-        on = states * np.asarray(self.lasts)
+        on: Floats = states * np.asarray(self.lasts)
         lit = np.flatnonzero(actions > 0)
         on[lit, actions[lit] - 1] = 1.0
         return on
 
 
 def count_bits(states: States, actions: States, next_states: States) -> Floats:
-    return next_states.sum(axis=1).astype(np.float64)
+    counts: Floats = next_states.sum(axis=1).astype(np.float64)
+    return counts
 
 
 def task(model: KnownModel, goal: object = count_bits, seed: int = 0) -> Task:

@@ -1,11 +1,11 @@
-"""Searching in a game through its learned networks: what is trained here is exported as plain arrays for the peers."""
+"""Searching in a game through its learned networks: the task, and its export as plain arrays for the peers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +21,38 @@ from mbagent_envs.random_keys import derive
 WIDTH = 20
 """Columns of the GeyserRunner that is learned: d = 30 bits."""
 
-SPEEDS = ((1, 1024), (16, 1024))
-"""(roots, simulations) that are timed."""
+BUDGETS = (16, 64, 256, 1024)
+"""Simulations with which mctx chooses; it is timed with each from one root and from 16 at once."""
+
+AT_ONCE = (1, 16)
+"""Roots that searches are timed at."""
+
+N_GOALS, N_STARTS, SEEDS = 8, 24, (0, 1, 2)
+"""Random goals, states to choose an action in, and searches in each of them."""
+
+HIT_COST = 2.0
 
 
-class NetworkSearch(Protocol):
-    """The library's own search through networks, timed on the same task as the peers'."""
+class PairwiseGoal:
+    """A reward of the next state y alone: ``linear @ y + y @ pairs @ y``.
 
-    def __call__(self, task: NetworkTask, roots: Ints, n_simulations: int, seed: int) -> Ints:
-        """Actions int64 [R] from roots int64 [R, F]."""
-        ...
+    Args:
+        linear: float64 [F].
+        pairs: float64 [F, F].
+    """
+
+    def __init__(self, linear: Floats, pairs: Floats) -> None:
+        """See the class."""
+        self.linear, self.pairs = linear, pairs
+        self._first, self._second = np.nonzero(pairs)
+        self._weights = pairs[self._first, self._second]
+
+    def __call__(self, states: Ints, actions: Ints, next_states: Ints) -> Floats:
+        """Rewards [B] of transitions to ``next_states`` int64 [B, F]."""
+        del states, actions
+        both = next_states.take(self._first, axis=1) & next_states.take(self._second, axis=1)
+        rewards: Floats = next_states @ self.linear + both @ self._weights
+        return rewards
 
 
 @dataclass(frozen=True)
@@ -39,17 +61,24 @@ class NetworkTask:
 
     Attributes:
         model: predictor and causal conditioner, trained.
-        linear: reward of a next state y: ``linear @ y + y @ pairs @ y``, float64 [F].
-        pairs: float64 [F, F].
-        roots: states of random play, int64 [R, F].
+        goals: the game's own reward, and random ones.
+        q: exact values of the actions in the starts under each goal, in the true game, [goals, N_STARTS, A].
+        starts: states to choose an action in, int64 [N_STARTS, F].
+        roots: states of random play to time searches from, int64 [R, F].
         gamma: discount of a step; leaves are worth 0.
     """
 
     model: NeuralTransitionModel
-    linear: Floats
-    pairs: Floats
+    goals: tuple[PairwiseGoal, ...]
+    q: Floats
+    starts: Ints
     roots: Ints
     gamma: float = 0.95
+
+    def regrets(self, goal: int, actions: Ints) -> float:
+        """Mean loss of ``actions`` [..., N_STARTS] under a goal, as a share of what random actions lose there."""
+        best, places = self.q[goal].max(axis=1), np.arange(len(self.starts))
+        return float((best - self.q[goal][places, actions]).mean() / (best - self.q[goal].mean(axis=1)).mean())
 
 
 def random_play(game: GeyserRunner, n: int, seed: int, episode: int = 50) -> TransitionDataset:
@@ -67,22 +96,54 @@ def random_play(game: GeyserRunner, n: int, seed: int, episode: int = 50) -> Tra
     return data
 
 
+def goals_of(n: int) -> tuple[PairwiseGoal, ...]:
+    """The game's own goal, and ``n`` with a standard normal income in each column instead; a hit costs the same in all."""
+    d, half = WIDTH + WIDTH // 2, WIDTH // 2
+    pairs = np.zeros((d, d))
+    pairs[np.arange(WIDTH - half, WIDTH), np.arange(WIDTH, d)] = -HIT_COST
+    incomes = [np.arange(WIDTH) / (WIDTH - 1), *(np.random.default_rng([seed, WIDTH]).normal(size=WIDTH) for seed in range(n))]
+    return tuple(PairwiseGoal(np.concatenate([income, np.zeros(half)]), pairs) for income in incomes)
+
+
+def exact_values(goal: PairwiseGoal, gamma: float) -> tuple[Ints, Floats]:
+    """All states int64 [S, F] of the true game, and the exact values [S, A] of their actions under a goal."""
+    game, half = GeyserRunner(width=WIDTH, hit_cost=HIT_COST), WIDTH // 2
+    states = np.zeros((WIDTH * half, WIDTH + half), dtype=np.int64)
+    number = np.arange(len(states))
+    states[number, number // half], states[number, WIDTH + number % half] = 1, 1
+    following, probabilities = [], []
+    for action in range(len(game.action_names)):
+        after, chance = game.transition_distributions(states.astype(np.int8), np.full(len(states), action))
+        following.append(after[:, :, :WIDTH].argmax(axis=2) * half + after[:, :, WIDTH:].argmax(axis=2))
+        probabilities.append(chance)
+    leads_to, likely = np.stack(following, axis=1), np.stack(probabilities, axis=1)
+    rewards, q = goal(states, number, states), np.zeros(leads_to.shape[:2])
+    while True:
+        new: Floats = (likely * (rewards + gamma * q.max(axis=1))[leads_to]).sum(axis=2)
+        if np.abs(new - q).max() <= 1e-12:
+            return states, new
+        q = new
+
+
 def build_task(seed: int, n_steps: int = 5000) -> NetworkTask:
     """Learns GeyserRunner from random play.
 
     Args:
-        seed: of play and fit.
+        seed: of play and fit, and of the starts.
         n_steps: of random play.
     """
-    game = GeyserRunner(width=WIDTH, hit_cost=2.0)
-    data = random_play(game, n_steps, seed)
+    data = random_play(GeyserRunner(width=WIDTH, hit_cost=HIT_COST), n_steps, seed)
     model = NeuralTransitionModel(data.cardinalities, data.n_actions)
     model.fit(data, seed=seed)
-    d, half = len(data.cardinalities), WIDTH // 2
-    linear, pairs = np.zeros(d), np.zeros((d, d))
-    linear[:WIDTH] = np.arange(WIDTH) / (WIDTH - 1)
-    pairs[np.arange(WIDTH - half, WIDTH), np.arange(WIDTH, d)] = -2.0
-    return NetworkTask(model, linear, pairs, data.rows().states[:: max(1, len(data) // 16)][:16])
+    met = data.rows().states
+    distinct = np.unique(met, axis=0)
+    starts = distinct[np.random.default_rng(seed).permutation(len(distinct))[:N_STARTS]]
+    goals, values = goals_of(N_GOALS), []
+    for goal in goals:
+        states, q = exact_values(goal, NetworkTask.gamma)
+        place = {state.tobytes(): i for i, state in enumerate(states)}
+        values.append(q[[place[state.tobytes()] for state in starts]])
+    return NetworkTask(model, goals, np.stack(values), starts, met[:: max(1, len(met) // 16)][:16])
 
 
 def exported(task: NetworkTask) -> dict[str, NDArray[np.generic]]:
@@ -104,25 +165,41 @@ def exported(task: NetworkTask) -> dict[str, NDArray[np.generic]]:
         **arrays,
         "members": model.conditioner.members.numpy(),
         "certain": np.asarray(config.certain),
-        "linear": task.linear,
-        "pairs": task.pairs,
+        "linear": task.goals[0].linear,
+        "pairs": task.goals[0].pairs,
+        "linear_goals": np.stack([goal.linear for goal in task.goals]),
+        "pairs_goals": np.stack([goal.pairs for goal in task.goals]),
+        "starts": task.starts,
         "roots": task.roots,
         "gamma": np.asarray(task.gamma),
     }
 
 
-def run_networks_in_mctx(python: Path, task: NetworkTask, repetitions: int = 5) -> tuple[list[Speed], Floats]:
-    """Searches through the networks in mctx.
+class PeerOnNetworks(NamedTuple):
+    """What mctx did.
 
-    Returns:
-        what was timed, and the mean next state [F] that mctx's sampler draws from the first root under action 0, to compare.
+    Attributes:
+        speeds: with each budget, from one root and from 16.
+        choices: budget -> actions int64 [goals, seeds, N_STARTS].
+        mean_next_state: of its sampler's draws from the first root under action 0, [F], to compare.
+    """
+
+    speeds: list[Speed]
+    choices: dict[int, Ints]
+    mean_next_state: Floats
+
+
+def run_networks_in_mctx(python: Path, task: NetworkTask, repetitions: int = 5) -> PeerOnNetworks:
+    """Searches through the networks in mctx.
 
     Raises:
         PeerError: it did not run.
     """
+    speeds = np.array([(n_roots, budget) for budget in BUDGETS for n_roots in AT_ONCE])
     with TemporaryDirectory() as folder:
         path = Path(folder) / "networks.npz"
-        arrays = {**exported(task), "speeds": np.array(SPEEDS), "repetitions": np.asarray(repetitions)}
-        np.savez(path, allow_pickle=False, **arrays)
+        asked = {"speeds": speeds, "repetitions": np.asarray(repetitions), "budgets": np.array(BUDGETS), "seeds": np.array(SEEDS)}
+        np.savez(path, allow_pickle=False, **exported(task), **asked)
         told = run_script(python, "mctx_networks", [str(path)])
-    return [Speed(**speed) for speed in told["speeds"]], np.array(told["mean_next_state"])
+    choices = {int(n): np.array(actions, dtype=np.int64) for n, actions in told["choices"].items()}
+    return PeerOnNetworks([Speed(**speed) for speed in told["speeds"]], choices, np.array(told["mean_next_state"]))

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from mbagent.analysis.planning_benchmark.networks import NetworkTask, exported, random_play
 from mbagent.analysis.planning_benchmark.noise import PAIRS_REDRAWN, build_sampler, following, random_inputs
 from mbagent.analysis.planning_benchmark.sampling import (
     EVERYTHING,
@@ -13,8 +12,6 @@ from mbagent.analysis.planning_benchmark.sampling import (
     upper_limit,
     using,
 )
-from mbagent.models.neural import NeuralTransitionModel
-from mbagent_envs.geyser_runner import GeyserRunner
 from mbagent_envs.random_keys import derive
 
 
@@ -76,16 +73,3 @@ def test_the_short_cut_draws_what_the_full_sweep_draws_where_the_conditioner_agr
         with using(model, certain, sweeps):
             draws.append(np.column_stack(model.sample(states, actions, derive(0, np.arange(3000)))))
     np.testing.assert_array_equal(draws[0], draws[1])
-
-
-def test_networks_are_exported_with_the_rewards_of_the_game() -> None:
-    game = GeyserRunner(width=20, hit_cost=2.0)
-    data = random_play(game, 100, 0)
-    assert len(data) == 100
-    model = NeuralTransitionModel(data.cardinalities, data.n_actions)
-    linear, pairs = np.zeros(30), np.zeros((30, 30))
-    arrays = exported(NetworkTask(model, linear, pairs, data.rows().states[:2]))
-    assert arrays["group_others"].shape == (31, 31, 16)
-    assert arrays["members"].tolist() == list(range(31))
-    with pytest.raises(ValueError, match="causal conditioner"):
-        exported(NetworkTask(build_sampler("sweeps", 6, 1), linear, pairs, data.rows().states))

@@ -1,0 +1,308 @@
+"""Tree search on a lookahead machine: long runs of compiled simulations, stopped only where the machine must be grown.
+
+Trial-based heuristic tree search (Keller and Helmert 2013) with transpositions: actions by upper confidence bounds (Auer et al.
+2002), successors by chance, Bellman backups on the way back. A simulation ends at a state that is not expanded yet, at the end of
+the episode, or after ``horizon`` steps. Simulations run in waves that grow with what was done; those of a wave see each other's
+visits, not yet their values ("watch the unobserved", Liu et al. 2020). A wave that met no unexpanded state needs neither model
+nor goal, so that the next begins at once, in the same compiled call.
+Shapes: N nodes, M edges, A actions, F factors, R roots, W simulations in a wave, H horizon.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.base import States
+from mbagent.models.state_graph import GraphArrays, StateGraph
+from mbagent.planning.leaf_values import LOWEST_KNOWN
+from mbagent.planning.lookahead import grow_lookahead
+from mbagent.planning.machine_planner import Imagined, MachinePlanner
+from mbagent.planning.machine_search import BOUND_BELOW, BOUND_TOP, MOST_COUNTED
+from mbagent.planning.value_iteration import TOLERANCE, Values, bellman, break_ties, score_edges, settle, sweep
+from mbagent_envs._compiled import borrowed, compiled, inlined
+from mbagent_envs.random_keys import derive, derive_one, mix
+
+Ints: TypeAlias = NDArray[np.int64]
+Floats: TypeAlias = NDArray[np.float64]
+
+FIRST_SWEEPS, GROWING_SWEEPS, FINAL_SWEEPS = 10, 3, 100
+"""Sweeps of value iteration, at most: before the first simulation, after each growth of the machine, after the last one."""
+
+LEAF_SAMPLES = 4
+"""Draws for each (state, action) of a node that the search adds."""
+
+FIRST_WAVE, WAVE_SHARE = 8, 4
+"""The first wave's simulations; later ones are at most one for so many that went before."""
+
+_SEARCH_SALT = 0x6EA6C4
+_STEP = np.uint64(0x9E3779B97F4A7C15)
+_UNIT = 2.0**-53
+
+
+class Tables(NamedTuple):
+    """What a search knows of a graph, with room to grow.
+
+    Attributes:
+        v, q, rewards, frontier: see ``value_iteration.Values``.
+        n: simulations through each (node, action), int64 [room, A].
+        met: simulations through each node, int64 [room].
+        weight: probability of an edge times discount, 0 where the episode ends, [room].
+        income: expected reward of each (node, action), [room, A].
+        path: nodes and actions that the wave's simulations passed through, int64 [R, W, H, 2].
+        lengths: of the paths, int64 [R, W].
+        leaves: unexpanded nodes that the wave met, each once, int64 [R * W].
+        spans: range of the values of the expanded nodes around each root, [R].
+        root_visits: simulations through the roots' actions, [R, A].
+    """
+
+    v: Floats
+    q: Floats
+    rewards: Floats
+    frontier: Floats
+    n: Ints
+    met: Ints
+    weight: Floats
+    income: Floats
+    path: Ints
+    lengths: Ints
+    leaves: Ints
+    spans: Floats
+    root_visits: Floats
+
+
+class Rules(NamedTuple):
+    """How to search; see PlannerSettings.
+
+    Attributes:
+        n_simulations: for each root.
+        wave: simulations of a root in a wave, at most.
+        gamma: discount of a step.
+        c_uct: weight of exploration.
+        prior_visits: visits that a first value counts for.
+        key: of the luck.
+    """
+
+    n_simulations: int
+    wave: int
+    gamma: float
+    c_uct: float
+    prior_visits: int
+    key: np.uint64
+
+
+class GraphSearch(MachinePlanner):
+    """UCT on lookahead machines around the roots, for thousands of simulations.
+
+    Every search starts from the values of a lookahead machine, each counting as ``prior_visits`` visits, and grows it where
+    simulations leave it. ``wave`` bounds the simulations of a root between two calls of the model.
+
+    Attributes:
+        imagined: successors drawn from the model so far, equal ones of a (state, action) counted once.
+    """
+
+    imagined = 0
+
+    def _imagine(self, roots: States) -> Imagined:
+        """Searches from each root [R, F]."""
+        graph, settings = self._empty_graph(), self.settings
+        nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
+        grow_lookahead(graph, nodes, settings.lookahead_states, settings.lookahead_samples, settings.horizon, settings.seed)
+        nothing, n_simulations = np.zeros((len(graph), graph.model.n_actions)), settings.num_simulations
+        first = Values(nothing[:, 0].copy(), nothing, score_edges(graph, self._known_goal()), np.zeros(len(roots)))
+        settle(graph, first, settings.gamma, FIRST_SWEEPS)
+        tables = _tables(graph, first, len(roots), min(settings.wave, n_simulations), settings.horizon)
+        weigh(graph.arrays, tables, settings.gamma, 0)
+        measure_spans(graph.arrays, tables)
+        key = np.uint64(derive(settings.seed, _SEARCH_SALT)[0])
+        rules = Rules(n_simulations, settings.wave, settings.gamma, settings.c_uct, int(settings.prior_visits), key)
+        done, growths = np.zeros(2, dtype=np.int64), 0
+        while n := run_waves(graph.arrays, nodes, tables, rules, BOUND_TOP, BOUND_BELOW, done):
+            growths += 1
+            tables = self._grown(graph, nodes, tables, n, int(derive(settings.seed, _SEARCH_SALT, growths)[0]))
+        size, n_edges = len(graph), graph.n_edges
+        self.imagined += n_edges
+        solution = Values(tables.v[:size], tables.q[:size], tables.rewards[:n_edges], tables.frontier)
+        settle(graph, solution, settings.gamma, FINAL_SWEEPS)
+        scores = break_ties(graph, solution.q, nodes, settings.gamma)
+        return Imagined(graph, nodes, solution, tables.root_visits, scores)
+
+    def _grown(self, graph: StateGraph, roots: Ints, tables: Tables, n: int, seed: int) -> Tables:
+        """Expands the ``n`` leaves that a wave has met, and takes in what follows from them."""
+        leaves, n_nodes, n_edges = np.sort(tables.leaves[:n]), len(graph), graph.n_edges
+        graph.expand(leaves, LEAF_SAMPLES, seed)
+        tables = _lengthened(tables, len(graph.arrays.tags), len(graph.arrays.sources))
+        tables.rewards[n_edges : graph.n_edges] = score_edges(graph, self._known_goal(), n_edges)
+        weigh(graph.arrays, tables, self.settings.gamma, n_edges)
+        take_in(graph.arrays, tables, self.settings.gamma, leaves, n_nodes)
+        return tables
+
+
+def _tables(graph: StateGraph, first: Values, n_roots: int, wave: int, horizon: int) -> Tables:
+    """Tables before the first simulation."""
+    tables = Tables(
+        first.v, first.q, first.rewards, first.frontier,
+        np.zeros(first.q.shape, dtype=np.int64), np.zeros(len(first.v), dtype=np.int64),
+        np.empty(len(first.rewards)), np.empty(first.q.shape),
+        np.empty((n_roots, wave, horizon, 2), dtype=np.int64), np.zeros((n_roots, wave), dtype=np.int64),
+        np.empty(n_roots * wave, dtype=np.int64), np.empty(n_roots), np.zeros((n_roots, graph.model.n_actions)),
+    )  # fmt: skip
+    return _lengthened(tables, len(graph.arrays.tags), len(graph.arrays.sources))
+
+
+def _lengthened(tables: Tables, n: int, m: int) -> Tables:
+    """Tables with room for n nodes and m edges."""
+    longer = {}
+    for names, size in ((("v", "q", "n", "met", "income"), n), (("rewards", "weight"), m)):
+        for name in names:
+            old = getattr(tables, name)
+            if len(old) < size:
+                longer[name] = np.empty((size, *old.shape[1:]), dtype=old.dtype)
+                longer[name][: len(old)] = old
+    return tables._replace(**longer)
+
+
+@compiled
+def weigh(graph: GraphArrays, tables: Tables, gamma: float, first_edge: int) -> None:
+    """Takes in the rewards of the edges from number ``first_edge`` on: whole nodes' edges."""
+    rewards, weight, income = tables.rewards, tables.weight, tables.income
+    node = -1
+    for edge in range(first_edge, graph.sizes[1]):
+        if graph.sources[edge] != node:
+            node = graph.sources[edge]
+            for a in range(income.shape[1]):
+                income[node, a] = 0.0
+        probability = graph.probabilities[edge]
+        income[node, graph.actions[edge]] += probability * rewards[edge]
+        weight[edge] = 0.0 if graph.terminated[edge] else gamma * probability
+
+
+@compiled
+def measure_spans(graph: GraphArrays, tables: Tables) -> None:
+    """Updates the range of the values around each root, which is that of group r: 1 where they are all alike."""
+    low, high = np.full(len(tables.spans), np.inf), np.full(len(tables.spans), -np.inf)
+    for node in range(graph.sizes[0]):
+        if graph.expanded[node]:
+            g = graph.groups[node]
+            low[g], high[g] = min(low[g], tables.v[node]), max(high[g], tables.v[node])
+    for r in range(len(low)):
+        tables.spans[r] = high[r] - low[r] if high[r] > low[r] else 1.0
+
+
+@compiled
+def take_in(graph: GraphArrays, tables: Tables, gamma: float, leaves: Ints, n_before: int) -> None:
+    """Values the ``leaves`` that were expanded, and the new nodes from number ``n_before`` on; sweeps over the roots' parts."""
+    n, m = graph.sizes[0], graph.sizes[1]
+    v, q, rewards, active = tables.v[:n], tables.q[:n], tables.rewards[:m], np.zeros(len(tables.frontier), dtype=np.bool_)
+    for node in range(n_before, n):
+        v[node], tables.met[node] = tables.frontier[graph.groups[node]], 0
+        q[node], tables.n[node] = 0.0, 0
+    for node in leaves:
+        tables.met[node] = 0
+        v[node] = bellman(node, graph, rewards, gamma, v, q)
+        active[graph.groups[node]] = True
+    sweep(graph, rewards, gamma, TOLERANCE, GROWING_SWEEPS, active, v, q, tables.frontier, LOWEST_KNOWN)
+    measure_spans(graph, tables)
+
+
+@inlined
+def _descend(
+    r: int, w: int, root: int, luck: np.uint64, scale: float, prior: int, graph: GraphArrays, top: Floats, below: Floats,
+    q: Floats, n: Ints, met: Ints, path: Ints,
+) -> tuple[int, int, np.uint64]:  # fmt: skip
+    """Simulation w from root r, down to its end; returns its length, the unexpanded node it met or -1, and the luck's state."""
+    first, counts, probabilities = graph.first, graph.counts, graph.probabilities
+    following, terminated, expanded, n_actions = graph.next_nodes, graph.terminated, graph.expanded, q.shape[1]
+    s, length, leaf = root, 0, -1
+    while length < path.shape[2]:
+        luck += _STEP
+        word, factor = mix(luck), scale * top[min(met[s] + prior * n_actions, MOST_COUNTED - 1)]
+        best, a = -np.inf, 0
+        for b in range(n_actions):
+            score = q[s, b] + factor * below[min(n[s, b] + prior, MOST_COUNTED - 1)]
+            # Ties are broken by luck: in a fixed order, simulations may go round the same few states for ever.
+            if score > best or (score == best and (word >> np.uint64(b % 11)) & np.uint64(1)):
+                best, a = score, b
+        n[s, a] += 1
+        met[s] += 1
+        path[r, w, length, 0], path[r, w, length, 1] = s, a
+        length += 1
+        u, e = float(word >> np.uint64(11)) * _UNIT, first[s, a]
+        last = e + counts[s, a] - 1
+        while e < last and u >= probabilities[e]:
+            u -= probabilities[e]
+            e += 1
+        if terminated[e]:
+            break
+        s = following[e]
+        if not expanded[s]:
+            leaf = s
+            break
+    return length, leaf, luck
+
+
+@inlined
+def _back_up(
+    r: int, w: int, length: int, graph: GraphArrays, weight: Floats, income: Floats, q: Floats, v: Floats, path: Ints
+) -> None:
+    """Bellman backups of the (node, action) pairs of simulation w from root r, the last one first."""
+    first, counts, following = graph.first, graph.counts, graph.next_nodes
+    for i in range(length - 1, -1, -1):
+        s, a = path[r, w, i, 0], path[r, w, i, 1]
+        total, begin = income[s, a], first[s, a]
+        for e in range(begin, begin + counts[s, a]):
+            total += weight[e] * v[following[e]]
+        q[s, a] = total
+        best = q[s, 0]
+        for b in range(1, q.shape[1]):
+            best = max(best, q[s, b])
+        v[s] = best
+
+
+@compiled
+def _run_wave(graph: GraphArrays, roots: Ints, t: Tables, rules: Rules, top: Floats, below: Floats, done: int, wave: int) -> int:
+    """Runs a wave down to its ends; returns how many unexpanded nodes it met."""
+    q, n, met, path, lengths, leaves, n_leaves = t.q, t.n, t.met, t.path, t.lengths, t.leaves, 0
+    for r in range(len(roots)):
+        root, scale = roots[r], rules.c_uct * t.spans[r]
+        luck = derive_one(rules.key, np.uint64(done))  # the same for every root
+        for w in range(wave):
+            lengths[r, w], leaf, luck = _descend(r, w, root, luck, scale, rules.prior_visits, graph, top, below, q, n, met, path)
+            t.root_visits[r, path[r, w, 0, 1]] += 1.0
+            if leaf >= 0 and met[leaf] == 0:
+                met[leaf] = 1  # until it is expanded: listed
+                leaves[n_leaves] = leaf
+                n_leaves += 1
+    return n_leaves
+
+
+@compiled
+def run_waves(graph: GraphArrays, roots: Ints, tables: Tables, rules: Rules, top: Floats, below: Floats, done: Ints) -> int:
+    """Runs waves until all simulations are done, or one has met nodes that are not expanded.
+
+    Args:
+        graph: what was imagined.
+        roots: int64 [R].
+        tables: updated.
+        rules: of the search.
+        top: part of the upper confidence bound by total visits, see ``machine_search``.
+        below: part by an action's.
+        done: simulations done, and those of a wave that waits for what it met, int64 [2]; updated.
+
+    Returns:
+        how many nodes must be expanded before the search can go on; they stand in ``tables.leaves``. 0: all is done.
+    """
+    graph, t = borrowed(graph), borrowed(tables)
+    while True:
+        for r in range(len(roots)):
+            for w in range(done[1]):
+                _back_up(r, w, t.lengths[r, w], graph, t.weight, t.income, t.q, t.v, t.path)
+        done[0] += done[1]
+        done[1] = min(max(done[0] // WAVE_SHARE, FIRST_WAVE), rules.wave, rules.n_simulations - done[0])
+        if done[1] == 0:
+            return 0
+        n_leaves = _run_wave(graph, roots, t, rules, top, below, done[0], done[1])
+        if n_leaves > 0:
+            return n_leaves
