@@ -50,7 +50,7 @@ SWEEPS = 150
 SETTLED = 1e-4
 """They end when no value moves by more than this share of the largest reward."""
 
-RIDGE = 1.0
+RIDGE = 0.1
 """Strength of the pull towards equal weights, in states."""
 
 _PLAY_SALT, _EXPAND_SALT, _SAMPLE_SALT = 0xF1A1, 0xF1A2, 0xF1A3
