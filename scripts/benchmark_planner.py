@@ -37,10 +37,11 @@ from mbagent.analysis.planning_benchmark.peers import PeerError
 from mbagent.analysis.planning_benchmark.quality import TOY_TEXT, play_game, play_table, scales, summary
 from mbagent.analysis.planning_benchmark.regret import Settings, compare
 from mbagent.analysis.planning_benchmark.sampling import compare_short_cut, compare_with_naive
+from mbagent.analysis.planning_benchmark.start import GAMES, first_decision
 
 Rows = list[dict[str, Any]]
 Say = Callable[[str], None]
-PARTS = ("quality", "decisions", "memory", "regret", "naive", "short cut", "networks")
+PARTS = ("quality", "decisions", "start", "memory", "regret", "naive", "short cut", "networks")
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,8 @@ class Args:
     """Measure planning and sampling."""
 
     parts: tuple[str, ...] = PARTS
-    """What to measure: quality of play, cost of decisions, memory, regret (and speed of searches), naive, short cut, networks."""
+    """What to measure: quality of play, cost of decisions, start of a process, memory, regret (and speed of searches), naive,
+    short cut, networks."""
     full: bool = False
     """5 agents of each kind, learned ones too, instead of 1 with the true model."""
     peers_python: Path | None = None
@@ -88,6 +90,15 @@ def measure_decisions(args: Args, say: Say) -> dict[str, Rows]:
         say(f"decisions: {setting.key}")
         rows += measure_latency(setting, args.first_seed + 1000, found[setting.key], 50 if args.full else 10)
     return {"decisions": rows}
+
+
+def measure_start(args: Args, say: Say) -> dict[str, Rows]:
+    """The first decision of a new process."""
+    rows = []
+    for key in GAMES:
+        say(f"start: {key}")
+        rows.append(first_decision(key, args.first_seed + 1000))
+    return {"start": rows}
 
 
 def measure_memory(args: Args, say: Say) -> dict[str, Rows]:
@@ -152,6 +163,7 @@ def measure_networks(args: Args, say: Say) -> dict[str, Rows]:
 _MEASURES: dict[str, Callable[[Args, Say], dict[str, Rows]]] = {
     "quality": measure_quality,
     "decisions": measure_decisions,
+    "start": measure_start,
     "memory": measure_memory,
     "regret": measure_regret,
     "naive": measure_naive,

@@ -112,8 +112,12 @@ class _Regression:
         return weights
 
 
-def learn_values(task: Task) -> LeafValues:
-    """What states are worth under the best behaviour found in imagined play; ``LOWEST_KNOWN`` where all are worth the same."""
+def learn_values(task: Task) -> tuple[LeafValues, States]:
+    """What states are worth under the best behaviour found in imagined play.
+
+    Returns:
+        (values, ``LOWEST_KNOWN`` where all steps earn the same; states int64 [N, F] that were met, distinct).
+    """
     leaf, met = LOWEST_KNOWN, np.zeros((0, len(task.model.cardinalities)), dtype=np.int64)
     for number in range(ROUNDS):
         played = _play(task, leaf, number)
@@ -121,7 +125,7 @@ def learn_values(task: Task) -> LeafValues:
         some = rng.choice(len(played), size=min(len(played), STATES_A_ROUND), replace=False)
         met = np.unique(np.concatenate([met, played[np.sort(some)]]), axis=0)
         leaf = _fit(task, met, leaf, number)
-    return leaf
+    return leaf, met
 
 
 def _play(task: Task, leaf: LeafValues, number: int) -> States:

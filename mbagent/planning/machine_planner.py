@@ -15,7 +15,7 @@ from mbagent.planning.goal import Goal
 from mbagent.planning.leaf_values import LOWEST_KNOWN
 from mbagent.planning.lookahead import grow_lookahead
 from mbagent.planning.planner import Plan, PlannerSettings, best_actions
-from mbagent.planning.rehearsal import Way, best_way
+from mbagent.planning.rehearsal import Way, plays_better
 from mbagent.planning.value_iteration import Machine, Values, break_ties, solve
 
 REHEARSED: dict[str, Any] = {"time_budget": None, "reuse_tree": False}
@@ -141,7 +141,7 @@ class MachinePlanner:
         """Learns values for the goal, and finds out whether plans are better with them."""
         settings = self.settings
         self._way = None  # should the goal fail now, it is tried again
-        leaf = learn_values(task)
+        leaf, met = learn_values(task)
         if len(leaf.weights) == 0:
             return usual
 
@@ -151,7 +151,8 @@ class MachinePlanner:
 
         self.settings = replace(settings, **REHEARSED)
         try:
-            return best_way(task, usual, (Way(leaf, 1, settings.n_samples), usual._replace(leaf=leaf)), act)
+            other = Way(leaf, 1, settings.n_samples)
+            return other if plays_better(replace(task, start=met), other, usual, act) else usual
         finally:
             self.settings, self._way = settings, None
 

@@ -28,9 +28,9 @@ class PlannerSettings:
         lookahead_states: states imagined around each root where the whole machine is larger than that.
         n_samples: draws for a (state, action) whose successors are too many to enumerate, in the whole machine.
         lookahead_samples: the same near a root, where the whole machine is too large.
-        learn_values: whether, where the whole machine is too large, values are learned in imagination, once for each goal. They
-            take the place of ``lookahead_states`` and ``lookahead_samples``, or are added to them, where that plays better in
-            imagination.
+        learn_values: whether, where the whole machine is too large, values are learned in imagination, once for each goal. Where
+            that plays better in imagination, searches begin with ``n_samples`` draws of a first step and these values, instead of
+            with a lookahead machine.
         leaf_values: "machine" (values of the reachable machine) or "rollouts" (random play).
         backup: "max" (an action is worth what the best behaviour after it is worth) or "mean" (plain UCT).
         choice: "mean", or "greatest" as in the paper (flat Monte Carlo only; it seeks risk).

@@ -63,7 +63,7 @@ def test_values_that_are_sums_over_factors_are_found() -> None:
     """A bit that is on is worth what it earns until it goes out: lasts / (1 - gamma lasts)."""
     model = Bulbs(8, n_actions=1)
     problem = Task(model, count_bits, np.ones((1, 8), dtype=np.int64), gamma=0.9, seed=0)
-    leaf = learn_values(problem)
+    leaf, _ = learn_values(problem)
     differences = leaf.weights[leaf.first + 1] - leaf.weights[leaf.first]
     np.testing.assert_allclose(differences, 0.8 / (1 - 0.9 * 0.8), rtol=0.2)
 
@@ -71,18 +71,19 @@ def test_values_that_are_sums_over_factors_are_found() -> None:
 def test_behaviour_by_learned_values_looks_beyond_one_step() -> None:
     """Every lit bit earns the same at once; one that lasts is worth more."""
     problem = task(Bulbs(2, lasts=(0.1, 0.95)))
-    leaf = learn_values(problem)
+    leaf, _ = learn_values(problem)
     assert greedy_actions(problem, leaf, np.array([[0, 0]]), 0)[0] == 2
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0])
 def test_nothing_is_learned_where_every_step_earns_the_same(value: float) -> None:
-    leaf = learn_values(task(Bulbs(3), lambda s, a, n: np.full(len(s), value)))
+    leaf, met = learn_values(task(Bulbs(3), lambda s, a, n: np.full(len(s), value)))
+    assert len(met) == 8
     assert len(leaf.weights) == 0
 
 
 def test_the_seed_decides() -> None:
-    first, again, other = (learn_values(task(Bulbs(4), seed=seed)) for seed in (1, 1, 2))
+    first, again, other = (learn_values(task(Bulbs(4), seed=seed))[0] for seed in (1, 1, 2))
     np.testing.assert_array_equal(first.weights, again.weights)
     assert (first.weights != other.weights).any()
 

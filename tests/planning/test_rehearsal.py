@@ -1,38 +1,53 @@
 import numpy as np
 import pytest
 
-from mbagent.models.base import Actions, Floats, States
+from mbagent.models.base import Actions, Bools, Floats, Randomness, States
 from mbagent.planning.fitted_values import Task
 from mbagent.planning.leaf_values import LOWEST_KNOWN
 from mbagent.planning.machine_planner import MachinePlanner
 from mbagent.planning.mcts import MctsPlanner
 from mbagent.planning.planner import PlannerSettings
-from mbagent.planning.rehearsal import Way, best_way
+from mbagent.planning.rehearsal import Way, _Trial, plays_better
 from tests.planning.test_fitted_values import Bulbs, count_bits
 
-USUAL, OTHER, THIRD = (Way(LOWEST_KNOWN, n, 1) for n in (1, 2, 3))
+USUAL, OTHER = (Way(LOWEST_KNOWN, n, 1) for n in (1, 2))
 N_BULBS = 14
 START = np.zeros((1, N_BULBS), dtype=np.int64)
 
 
-def chosen(actions: dict[int, int]) -> Way:
-    """The way taken where each way, told by its number of states, always takes one action."""
+def better(usual: int, other: int) -> bool:
+    """Whether taking always one action plays better than taking always another."""
     task = Task(Bulbs(3, lasts=0.5), count_bits, np.zeros((1, 3), dtype=np.int64), gamma=0.99, seed=0)
 
     def act(way: Way, states: States) -> Actions:
-        return np.full(len(states), actions[way.states])
+        return np.full(len(states), usual if way == USUAL else other)
 
-    return best_way(task, USUAL, (OTHER, THIRD), act)
+    return plays_better(task, OTHER, USUAL, act)
 
 
-def test_the_first_better_way_is_taken() -> None:
-    assert chosen({1: 0, 2: 1, 3: 2}) == OTHER
-    assert chosen({1: 0, 2: 0, 3: 2}) == THIRD
+def test_a_better_way_is_found() -> None:
+    assert better(0, 1)
 
 
 def test_in_doubt_the_usual_way_is_taken() -> None:
-    assert chosen({1: 1, 2: 0, 3: 1}) == USUAL
-    assert chosen({1: 1, 2: 2, 3: 3}) == USUAL  # as good, and not alike
+    assert not better(1, 0)
+    assert not better(1, 1)
+    assert not better(1, 2)  # as good, and not alike
+
+
+def test_episodes_that_end_earn_nothing_more() -> None:
+    class Ending(Bulbs):
+        def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
+            after, _ = super().sample(states, actions, rng)
+            return after, actions == 1
+
+    task = Task(Ending(1), count_bits, np.zeros((1, 1), dtype=np.int64), gamma=0.5, seed=0)
+    lit, dark = (
+        _Trial(task, USUAL, lambda way, s: np.ones(len(s), int)),
+        _Trial(task, USUAL, lambda way, s: np.zeros(len(s), int)),
+    )
+    assert set(lit.returns(3)) == {1.0}
+    assert set(dark.returns(3)) == {0.0}
 
 
 def settings(**changes: object) -> PlannerSettings:

@@ -18,6 +18,7 @@ Row: TypeAlias = Mapping[str, Any]
 TITLES = {
     "quality": "How well agents play with the default settings",
     "decisions": "What a decision costs beside a forward pass of PPO",
+    "start": "The first decision of a new process",
     "memory": "Memory over many decisions",
     "regret": "What searches lose, against the number of simulations",
     "speed": "Speed of searches on a table",
@@ -33,6 +34,8 @@ NOTES = {
     "episodes, with its bootstrap interval. Of tables the exact value of what the agent does.",
     "decisions": "Median processor time on one core about single observations, none met twice. The reward is the game's own, or "
     "the same as a plain Python function; what is done once for a goal (the reachable machine, if it is small) is timed apart.",
+    "start": "Processor time in a new process, after imports, with everything compiled by an earlier one. The first decision "
+    "holds what is done once for a goal.",
     "memory": "Memory that the process holds after a tenth of the decisions and in the end.",
     "regret": "Random worlds of 25 states and 4 actions with exact values known; every search gets the same crude leaf values "
     "(exact value plus noise as large as the values' spread), but for searches by random play. 1 is what a random action loses, "

@@ -1,0 +1,57 @@
+"""How long the first decision of a new process takes, with everything compiled by an earlier one, imports apart."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from mbagent.agent import ModelLearningAgent
+from mbagent.analysis.cases import find_case
+
+Row = dict[str, Any]
+
+GAMES = ("geyser_deterministic", "flier_catcher", "maneuverer")
+
+_PROCESS = """
+import json, sys, time
+import numpy as np
+import mbagent_envs
+from mbagent import ModelLearningAgent
+began = time.process_time()
+agent = ModelLearningAgent.load(sys.argv[1])
+loaded = time.process_time()
+obs = np.load(sys.argv[2])
+agent.predict(obs)
+first = time.process_time()
+agent.predict(obs)
+print(json.dumps([loaded - began, first - loaded, time.process_time() - first]))
+"""
+
+
+def first_decision(key: str, seed: int, steps: int = 5000) -> Row:
+    """Seconds of processor time that a learned agent takes for loading, its first decision and its second, in a new process.
+
+    The first decision holds what is done once for a goal: solving the machine, or learning values for it.
+
+    Raises:
+        RuntimeError: a process failed.
+    """
+    env = find_case(key).make_env()
+    agent = ModelLearningAgent("MctsPolicy", env, seed=seed).learn(steps, log_interval=None)
+    with TemporaryDirectory() as folder:
+        saved, observation = Path(folder) / "agent.zip", Path(folder) / "obs.npy"
+        agent.save(saved)
+        np.save(observation, env.reset(seed=seed)[0], allow_pickle=False)
+        command = [sys.executable, "-c", _PROCESS, str(saved), str(observation)]
+        for _ in range(2):  # the first one compiles what has not been compiled yet
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode:
+                raise RuntimeError(f"A new process could not decide: {done.stderr.strip().splitlines()[-1]}")
+    loading, first, second = json.loads(done.stdout.strip().splitlines()[-1])
+    return {"game": key, "loading, s": loading, "first decision, s": first, "second decision, ms": 1e3 * second}
