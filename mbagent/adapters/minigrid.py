@@ -37,7 +37,7 @@ class WholeGrid(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstruct
         self.world = world
         self.carried = carried
         self._agent = OBJECT_TO_IDX["agent"], COLOR_TO_IDX["red"]
-        self.observation_space = spaces.Box(0, 255, (world.width, world.height, 3), np.uint8)  # type: ignore[arg-type]
+        self.observation_space = spaces.Box(0, 255, (world.width, world.height, 3), np.uint8)
 
     def observation(self, observation: Any) -> NDArray[np.uint8]:
         """The grid, uint8 [width, height, 3]."""
