@@ -54,6 +54,7 @@ class RddlEnv(gym.Env[NDArray[np.integer[Any]], np.int64], gym.utils.EzPickle):
     def __init__(self, domain: str, instance: str | int = 1) -> None:
         """See the class."""
         gym.utils.EzPickle.__init__(self, domain, instance)
+        self.domain, self.instance = domain, instance
         self.rddl = load_rddl(domain, instance)
         ranges = {name: _values_of(part, name) for name, part in self.rddl.observation_space.spaces.items()}
         self.fluents = tuple(ranges)
