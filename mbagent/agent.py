@@ -64,7 +64,7 @@ class ModelLearningAgent(SavableAlgorithm):
         model: "auto" (at present "graphs": decision graphs found from data), "networks" (predictor and conditioner trained
             by gradient), "paper" (section 3's networks), "tabular", "direct" (see ``forecasts``), another registered name,
             or a TransitionModel.
-        exploration: "auto" or "random".
+        exploration: "auto" or "random"; "persistent" keeps random actions for a while; or an Exploration.
         gamma: discount of a step when planning.
         num_simulations: simulations for each decision.
         time_budget: seconds for each decision instead (see PlannerSettings), or None.

@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mbagent.analysis.external.experiment import AGENTS, TRUE, Row, Task, run_task
-from mbagent.analysis.external.worlds import WORLDS, find_world
+from mbagent.analysis.external.worlds import CONTINUOUS, WORLDS, find_world
 from mbagent.analysis.folders import replaced, set_aside
 from mbagent.analysis.parallel import run_all
 from mbagent.analysis.statistics import interquartile_interval
@@ -41,7 +41,7 @@ class Args:
     full: bool = False
     """5 seeds, 100 episodes."""
     worlds: tuple[str, ...] = tuple(world.name for world in WORLDS)
-    """Which environments."""
+    """Which environments; "CartPole, binned" and "MountainCar, binned" are the examples of docs/environments.md."""
     agents: tuple[str, ...] = AGENTS
     """Which agents."""
     seeds: int | None = None
@@ -80,7 +80,7 @@ def plan(args: Args) -> list[Task]:
     for world in map(find_world, args.worlds):
         steps = args.steps or world.steps
         for agent in args.agents:
-            if world.missing is None and not (agent == TRUE and world.kind == "minigrid"):
+            if world.missing is None and not (agent == TRUE and world.kind in ("minigrid", "binned")):
                 more = [
                     Task(world, agent, args.first_seed + i, steps, episodes, args.baseline_steps or steps) for i in range(seeds)
                 ]
@@ -116,7 +116,7 @@ def show(rows: Sequence[Row], console: Console) -> None:
     for row in rows:
         groups.setdefault((row["world"], row["agent"]), []).append(row)
     order = {name: i for i, name in enumerate(AGENTS)}
-    places = {world.name: i for i, world in enumerate(WORLDS)}
+    places = {world.name: i for i, world in enumerate((*WORLDS, *CONTINUOUS))}
     for (world, agent), group in sorted(groups.items(), key=lambda item: (places[item[0][0]], order[item[0][1]])):
         mean = {name: float(np.mean([row[name] for row in group])) for name in group[0] if name not in ("world", "agent")}
         known = np.isfinite(mean["normalised"])

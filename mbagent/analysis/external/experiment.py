@@ -39,7 +39,7 @@ class Task:
         seed: of learning and play.
         steps: environment steps for learning.
         episodes: to play.
-        reward_steps: steps for the baselines, which may be more.
+        baseline_steps: steps for the baselines, which may be more.
     """
 
     world: World
@@ -122,7 +122,8 @@ def _players(task: Task) -> Sequence[Callable[[], Player]]:
 
 
 def _learned(task: Task, env: gym.Env[Any, Any]) -> ModelLearningAgent:
-    return ModelLearningAgent("MctsPolicy", env, seed=task.seed).learn(task.steps, log_interval=None)
+    agent = ModelLearningAgent("MctsPolicy", env, seed=task.seed, **task.world.settings)
+    return agent.learn(task.steps, log_interval=None)
 
 
 def _imagined(agent: ModelLearningAgent, limit: int | None) -> gym.Env[Any, Any]:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.wrappers import TransformObservation
+from gymnasium.wrappers import DiscretizeObservation, TransformObservation
 
 from mbagent.adapters.minigrid import make_minigrid
 from mbagent.adapters.rddl import RddlEnv
@@ -33,22 +33,26 @@ class World:
 
     Attributes:
         name: what the results call it.
-        kind: which package it is from.
+        kind: which package it is from; "binned" for continuous ones, cut into bins.
         target: id for ``gym.make``, or name of an RDDL domain.
         kwargs: further arguments.
         steps: environment steps for learning.
+        bins: of each dimension, where it is binned.
+        settings: of the agent, where they are not its defaults.
     """
 
     name: str
-    kind: Literal["toy_text", "rddl", "minigrid"]
+    kind: Literal["toy_text", "rddl", "minigrid", "binned"]
     target: str
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     steps: int = 20_000
+    bins: tuple[int, ...] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def missing(self) -> str | None:
         """The extra that must be installed first, or None."""
-        needed = {"toy_text": (), "rddl": ("pyRDDLGym", "rddlrepository"), "minigrid": ("minigrid",)}[self.kind]
+        needed = {"rddl": ("pyRDDLGym", "rddlrepository"), "minigrid": ("minigrid",)}.get(self.kind, ())
         return self.kind if any(importlib.util.find_spec(name) is None for name in needed) else None
 
     def make(self) -> gym.Env[Any, Any]:
@@ -59,7 +63,8 @@ class World:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DeprecationWarning)
                 return make_minigrid(self.target, **self.kwargs)
-        return gym.make(self.target, **self.kwargs)
+        env = gym.make(self.target, **self.kwargs)
+        return DiscretizeObservation(clipped(env), self.bins, multidiscrete=True) if self.kind == "binned" else env
 
     def make_for_networks(self) -> gym.Env[Any, Any]:
         """A new copy as SB3's networks take it best: images of numbers as a row of small floats."""
@@ -82,16 +87,27 @@ WORLDS = (
 """The development set; the agent's defaults are the same for all."""
 
 
+CONTINUOUS = (
+    World("CartPole, binned", "binned", "CartPole-v1", bins=(3, 3, 8, 8)),
+    World("MountainCar, binned", "binned", "MountainCar-v0", bins=(30, 30), settings={"exploration": "persistent"}),
+)
+"""The examples of docs/environments.md."""
+
+UNBOUNDED = 3.0
+"""Variables without bounds are clipped at so much."""
+
+
 def find_world(name: str) -> World:
     """The world called ``name``.
 
     Raises:
         ValueError: there is none; the message lists those there are.
     """
-    for world in WORLDS:
+    known = (*WORLDS, *CONTINUOUS)
+    for world in known:
         if world.name == name:
             return world
-    raise ValueError(f"There is no world {name!r}; choose from {', '.join(repr(world.name) for world in WORLDS)}.")
+    raise ValueError(f"There is no world {name!r}; choose from {', '.join(repr(world.name) for world in known)}.")
 
 
 @cache
@@ -131,6 +147,15 @@ def scale_of(world: World) -> Scale:
     assert isinstance(space, gym.spaces.Discrete)
     chance = random_policy(int(space.n), seed=1)
     return Scale(float(evaluate_env(world.make, chance, episodes=RANDOM_EPISODES, seed=1).default.mean()), float("nan"))
+
+
+def clipped(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+    """The same world, its variables between finite bounds."""
+    space = env.observation_space
+    assert isinstance(space, gym.spaces.Box)
+    low, high = (np.where(np.isfinite(bound), bound, sign * UNBOUNDED) for sign, bound in ((-1, space.low), (1, space.high)))
+    bounds = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32))
+    return TransformObservation(env, lambda obs: np.clip(obs, bounds.low, bounds.high), bounds)
 
 
 def for_networks(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
