@@ -8,12 +8,16 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.base import States
+from mbagent.models.base import Actions, States
 from mbagent.policies import NO_GOAL, as_batch
 from mbagent.rewards import GivenReward, RewardFn
 
 if TYPE_CHECKING:
     from mbagent.agent import ModelLearningAgent
+
+
+MOST_REWARDS = 100_000
+"""Rewards of so many transitions are remembered."""
 
 
 class LearnedEnv(gym.Env[Any, Any]):
@@ -60,6 +64,7 @@ class LearnedEnv(gym.Env[Any, Any]):
         self._reward = policy.goal if reward_fn is None else GivenReward(reward_fn, policy.factored, policy.actions)
         self._starts, self._shares = _starts(agent)
         self.max_episode_steps = max_episode_steps
+        self._rewards: dict[bytes, float] = {}
         self._state: States | None = None
         self._steps = 0
 
@@ -82,12 +87,21 @@ class LearnedEnv(gym.Env[Any, Any]):
             raise gym.error.ResetNeeded("Call reset() before step().")
         actions = self._actions.encode(as_batch(self.action_space, action)[0])
         following, over = self.model.sample(self._state, actions, self.np_random.integers(2**64, size=1, dtype=np.uint64))
-        assert self._reward is not None
-        reward = float(self._reward(self._state, actions, following)[0])
+        reward = self._earned(self._state, actions, following)
         self._state, self._steps = following, self._steps + 1
         terminated = bool(over[0])
         truncated = not terminated and self.max_episode_steps is not None and self._steps >= self.max_episode_steps
         return self._shown(following), reward, terminated, truncated, {}
+
+    def _earned(self, states: States, actions: Actions, following: States) -> float:
+        """The reward of a transition; it is asked for once, as learned rewards and users' functions are quick in batches only."""
+        key = states.tobytes() + actions.tobytes() + following.tobytes()
+        if key not in self._rewards:
+            if len(self._rewards) >= MOST_REWARDS:
+                self._rewards.clear()
+            assert self._reward is not None
+            self._rewards[key] = float(self._reward(states, actions, following)[0])
+        return self._rewards[key]
 
     def _shown(self, state: States) -> Any:
         return _first(self._space.decode(state))
