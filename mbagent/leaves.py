@@ -70,6 +70,11 @@ class Leaf:
         numbers = flat.astype(np.int64) - self.low
         outside = (numbers < 0) | (numbers >= np.asarray(self.cardinalities))
         if outside.any():
+            if _WIDEST in self.cardinalities:
+                raise ValueError(
+                    f"The {kind}{self.where} holds the value {flat[outside][0]}; whole numbers are told apart from -2^61 to 2^61 only: "
+                    "make them smaller in a gymnasium.ObservationWrapper."
+                )
             raise ValueError(
                 f"The {kind}{self.where} holds the value {flat[outside][0]}, which lies outside {self.space}; "
                 f"pass {kind}s of the environment's own space."

@@ -94,6 +94,13 @@ def test_cells_of_a_plane_share_their_values() -> None:
     assert space.with_values(space.encode(seen)).cardinalities == (3, 2) * 9  # 0, 7 and 8; 0 and 9
 
 
+def test_numbers_that_cannot_be_told_apart_are_refused() -> None:
+    space = FactoredSpace(spaces.Box(-(2**63), 2**63 - 1, (1,), dtype=np.int64))
+    assert space.decode(space.encode(np.array([[2**61 - 1], [-(2**61)]])))[:, 0].tolist() == [2**61 - 1, -(2**61)]
+    with pytest.raises(ValueError, match="2.61"):
+        space.encode(np.array([[2**62]]))
+
+
 def test_too_many_values_are_refused_when_they_are_met() -> None:
     space = FactoredSpace(spaces.Discrete(100_000))
     with pytest.raises(ValueError, match="took 5000 values"):
