@@ -72,8 +72,8 @@ class Leaf:
         if outside.any():
             if _WIDEST in self.cardinalities:
                 raise ValueError(
-                    f"The {kind}{self.where} holds the value {flat[outside][0]}; whole numbers are told apart from -2^61 to 2^61 only: "
-                    "make them smaller in a gymnasium.ObservationWrapper."
+                    f"The {kind}{self.where} holds the value {flat[outside][0]}; whole numbers are told apart from -2^61 to 2^61 "
+                    "only: make them smaller in a gymnasium.ObservationWrapper."
                 )
             raise ValueError(
                 f"The {kind}{self.where} holds the value {flat[outside][0]}, which lies outside {self.space}; "
