@@ -38,6 +38,7 @@ class World:
         kwargs: further arguments.
         steps: environment steps for learning.
         bins: of each dimension, where it is binned.
+        bounds: what each dimension is clipped at first; nothing to leave them as they are.
         settings: of the agent, where they are not its defaults.
     """
 
@@ -47,6 +48,7 @@ class World:
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     steps: int = 20_000
     bins: tuple[int, ...] = ()
+    bounds: tuple[float, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -64,7 +66,8 @@ class World:
                 warnings.simplefilter("ignore", DeprecationWarning)
                 return make_minigrid(self.target, **self.kwargs)
         env = gym.make(self.target, **self.kwargs)
-        return DiscretizeObservation(clipped(env), self.bins, multidiscrete=True) if self.kind == "binned" else env
+        env = clipped(env, self.bounds) if self.bounds else env
+        return DiscretizeObservation(env, self.bins, multidiscrete=True) if self.bins else env
 
     def make_for_networks(self) -> gym.Env[Any, Any]:
         """A new copy as SB3's networks take it best: images of numbers as a row of small floats."""
@@ -88,13 +91,10 @@ WORLDS = (
 
 
 CONTINUOUS = (
-    World("CartPole, binned", "binned", "CartPole-v1", bins=(3, 3, 8, 8)),
+    World("CartPole, binned", "binned", "CartPole-v1", bins=(3, 3, 8, 8), bounds=(2.4, 3.0, 0.21, 3.0)),
     World("MountainCar, binned", "binned", "MountainCar-v0", bins=(30, 30), settings={"exploration": "persistent"}),
 )
 """The examples of docs/environments.md."""
-
-UNBOUNDED = 3.0
-"""Variables without bounds are clipped at so much."""
 
 
 def find_world(name: str) -> World:
@@ -149,13 +149,10 @@ def scale_of(world: World) -> Scale:
     return Scale(float(evaluate_env(world.make, chance, episodes=RANDOM_EPISODES, seed=1).default.mean()), float("nan"))
 
 
-def clipped(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
-    """The same world, its variables between finite bounds."""
-    space = env.observation_space
-    assert isinstance(space, gym.spaces.Box)
-    low, high = (np.where(np.isfinite(bound), bound, sign * UNBOUNDED) for sign, bound in ((-1, space.low), (1, space.high)))
-    bounds = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32))
-    return TransformObservation(env, lambda obs: np.clip(obs, bounds.low, bounds.high), bounds)
+def clipped(env: gym.Env[Any, Any], bounds: tuple[float, ...]) -> gym.Env[Any, Any]:
+    """The same world, each variable between its bound and minus that."""
+    high = np.array(bounds, dtype=np.float32)
+    return TransformObservation(env, lambda obs: np.clip(obs, -high, high), gym.spaces.Box(-high, high))
 
 
 def for_networks(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:

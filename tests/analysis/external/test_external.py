@@ -50,7 +50,7 @@ def test_continuous_worlds_are_clipped_and_cut_into_bins() -> None:
         env.reset(seed=0)
         for _ in range(5):
             assert env.observation_space.contains(env.step(1)[0])
-    scale = scale_of(World("x", "binned", "CartPole-v1", bins=(2, 2, 2, 2)))
+    scale = scale_of(World("x", "binned", "CartPole-v1", bins=(2, 2, 2, 2), bounds=(1.0, 1.0, 1.0, 1.0)))
     assert 15 < scale.random < 30
     assert np.isnan(scale.reference)
 
