@@ -39,11 +39,9 @@ class LearnedEnv(gym.Env[Any, Any]):
         TypeError: the reward is no function of (obs, action, next_obs).
 
     Example:
-        >>> import gymnasium as gym, mbagent
-        >>> from stable_baselines3 import PPO
-        >>> agent = mbagent.ModelLearningAgent("MctsPolicy", gym.make("mbagent/GeyserRunner-v0"), seed=0).learn(2000)
-        >>> env = mbagent.LearnedEnv(agent, lambda obs, action, next_obs: next_obs[:, 9], max_episode_steps=100)
-        >>> model = PPO("MlpPolicy", env).learn(10_000)  # doctest: +SKIP
+        agent = mbagent.ModelLearningAgent("MctsPolicy", env, seed=0).learn(20_000)
+        imagined = mbagent.LearnedEnv(agent, lambda obs, action, next_obs: next_obs[:, 9], max_episode_steps=100)
+        PPO("MlpPolicy", imagined).learn(100_000)
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own form
