@@ -7,6 +7,7 @@ Importing this package registers the games ``mbagent/GeyserRunner-v0``, ``mbagen
 import mbagent_envs
 from mbagent.agent import ModelLearningAgent
 from mbagent.explanations import Explanation, Future, Step
+from mbagent.learned_env import LearnedEnv
 from mbagent.planning.planner import PlannerSettings
 from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
 from mbagent.rewards import RewardFn
@@ -21,6 +22,7 @@ __all__ = [
     "FactoredSpace",
     "FlatMonteCarloPolicy",
     "Future",
+    "LearnedEnv",
     "MctsPolicy",
     "ModelLearningAgent",
     "PlannerPolicy",

@@ -20,15 +20,16 @@ from mbagent.arguments import (
     check_model,
     check_seed,
     check_timesteps,
+    fitting_model,
+    planner_settings,
 )
-from mbagent.experience import ExperienceRecorder, distinct_rows
+from mbagent.experience import Experience, ExperienceRecorder, distinct_rows
 from mbagent.explanations import Explanation, explain
 from mbagent.exploration import EXPLORATIONS, Exploration
 from mbagent.goals import GoalBook
 from mbagent.learned_reward import LearnedReward
 from mbagent.models.base import FitReport, TransitionModel
 from mbagent.models.factory import build_model
-from mbagent.planning.planner import PlannerSettings
 from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
 from mbagent.reporting import fit_progress, log_fit, log_rollout
 from mbagent.rewards import RewardFn
@@ -63,7 +64,7 @@ class ModelLearningAgent(SavableAlgorithm):
         model: "auto" (at present "graphs": decision graphs found from data), "networks" (predictor and conditioner trained
             by gradient), "paper" (section 3's networks), "tabular", "direct" (see ``forecasts``), another registered name,
             or a TransitionModel.
-        exploration: "auto" or "random".
+        exploration: "auto" or "random"; "persistent" keeps random actions for a while; or an Exploration.
         gamma: discount of a step when planning.
         num_simulations: simulations for each decision.
         time_budget: seconds for each decision instead (see PlannerSettings), or None.
@@ -146,30 +147,23 @@ class ModelLearningAgent(SavableAlgorithm):
         """The transition model."""
         return self.policy.transition_model
 
-    def _settings(self) -> PlannerSettings:
-        own = {name: getattr(self, name) for name in ("num_simulations", "time_budget", "gamma", "horizon")}
-        known = sorted(set(PlannerSettings.__dataclass_fields__) - {*own, "seed"})
-        unknown = sorted(set(self.policy_kwargs) - set(known))
-        if unknown:
-            raise TypeError(f"policy_kwargs has no {unknown[0]!r}; it takes {', '.join(known)}.")
-        return PlannerSettings(**own, seed=self._planning_seed, **self.policy_kwargs)
+    @property
+    def transitions(self) -> TransitionDataset:
+        """What was met, in the model's factors."""
+        return self.experience.coded(self.policy.factored)
 
     def _setup_model(self) -> None:
         if not hasattr(self, "observation_space"):
             raise ValueError("env must be an environment or a registered id, got None; load() is the way to an agent without.")
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
-        settings = self._settings()
+        own = {name: getattr(self, name) for name in ("num_simulations", "time_budget", "gamma", "horizon")}
+        settings = planner_settings(own, self.policy_kwargs, self._planning_seed)
         space, actions = FactoredSpace(self.observation_space), ActionEnumeration(self.action_space)
-        model = self.model_name
-        if isinstance(model, str):
-            model = build_model(model, space, actions.n, check_learning_rate(self.lr_schedule(1.0)))
-        elif tuple(model.cardinalities) != space.cardinalities or model.n_actions != actions.n:
-            raise ValueError(
-                f"The model has {len(model.cardinalities)} factors and {model.n_actions} actions, but the environment "
-                f"{len(space)} and {actions.n}; build the model for this environment's spaces."
-            )
-        reward_model = LearnedReward(space.cardinalities, actions.n, space.planes, seed=self._planning_seed)
+        self.experience = Experience(space, actions.n)
+        if isinstance(self.model_name, str):  # a model that is given has the factors that it has
+            space = self.experience.coding()
+        model, reward_model = self._build_models(space, actions.n)
         policy = self.policy_class(
             self.observation_space,
             self.action_space,
@@ -177,12 +171,13 @@ class ModelLearningAgent(SavableAlgorithm):
             model=model,
             reward_model=reward_model,
             settings=settings,
+            factored=space,
         )
         assert isinstance(policy, PlannerPolicy)
         self.policy = policy
-        self._explorer = self._build_exploration(actions.n)
-        self.transitions = TransitionDataset(space.cardinalities, actions.n)
-        self.goals = GoalBook(policy, self.transitions)
+        chosen = self.exploration_name
+        self._explorer = EXPLORATIONS[chosen](actions.n) if isinstance(chosen, str) else chosen
+        self.goals = GoalBook(policy, self.experience)
         if self.env is not None:
             self.goals.take_environment(self.env)
         start_states = getattr(model, "start_states", None)
@@ -192,9 +187,20 @@ class ModelLearningAgent(SavableAlgorithm):
         self.policy.refresh()
         self.set_reward(self._custom_reward) if self._custom_reward is not None else self._refresh()
 
-    def _build_exploration(self, n_actions: int) -> Exploration:
-        chosen = self.exploration_name
-        return EXPLORATIONS[chosen](n_actions) if isinstance(chosen, str) else chosen
+    def _build_models(self, space: FactoredSpace, n_actions: int) -> tuple[TransitionModel, LearnedReward]:
+        """A transition model and a learned reward, both new, of these factors."""
+        model, rate = self.model_name, check_learning_rate(self.lr_schedule(1.0))
+        model = build_model(model, space, n_actions, rate) if isinstance(model, str) else fitting_model(model, space, n_actions)
+        return model, LearnedReward(space.cardinalities, n_actions, space.planes, seed=self._planning_seed)
+
+    def _recode(self, space: FactoredSpace) -> None:
+        """Factors whose values are those of ``space``; where that changes anything, nothing is learned in them yet."""
+        policy = self.policy
+        if space.same_factors(policy.factored):
+            return
+        starts = space.narrow(np.asarray(policy.factored.widen(policy.start_states), dtype=np.int64))
+        policy.recode(space, *self._build_models(space, policy.actions.n), starts, False)
+        self.goals.recode()
 
     # ------------------------------------------------------------------ goals
 
@@ -265,7 +271,7 @@ class ModelLearningAgent(SavableAlgorithm):
         steps, log_interval = check_timesteps(total_timesteps), check_log_interval(log_interval)
         total, callbacks = self._setup_learn(steps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if fresh_start or self._recorder is None:
-            self._recorder = ExperienceRecorder(self.policy.factored, self.transitions, self.n_envs)
+            self._recorder = ExperienceRecorder(self.experience.space, self.experience.dataset, self.n_envs)
             self._recorder.reset(self._last_obs)
         callbacks.on_training_start(locals(), globals())
         going, iteration = True, 0
@@ -279,7 +285,7 @@ class ModelLearningAgent(SavableAlgorithm):
                     self.logger.dump(self.num_timesteps)
         finally:  # an interrupted run keeps what it met: learn(0) fits to it
             self._recorder.flush()
-        if len(self.transitions):
+        if len(self.experience.dataset):
             self._fit(self._recorder, progress_bar)
             if log_interval is not None:
                 log_rollout(self, self.start_time, self._num_timesteps_at_start)
@@ -289,12 +295,11 @@ class ModelLearningAgent(SavableAlgorithm):
 
     def _explore(self, until: int, callback: BaseCallback, recorder: ExperienceRecorder) -> bool:
         """Steps all environments until ``num_timesteps`` reaches ``until``; False if a callback stopped it."""
-        env = self.env
-        assert env is not None
+        env = cast("VecEnv", self.env)
         callback.on_rollout_start()
         while self.num_timesteps < until:
             assert recorder.states is not None
-            indices = self._explorer.act(recorder.states, self._rng)
+            indices = self._explorer.act(self.policy.factored.narrow(recorder.states), self._rng)
             actions = self.policy.actions.decode(indices)
             new_obs, rewards, dones, infos = env.step(actions)
             self.num_timesteps += env.num_envs
@@ -315,13 +320,15 @@ class ModelLearningAgent(SavableAlgorithm):
 
     def _fit(self, recorder: ExperienceRecorder, progress_bar: bool) -> None:
         """Fits the model, then works out goal and machine."""
+        if isinstance(self.model_name, str):
+            self._recode(self.experience.coding())
         with fit_progress(progress_bar) as progress:
             report = self.model.fit(self.transitions, seed=self._planning_seed, progress=progress)
         self._n_updates += 1
         self.fit_report = report
         if report.advice is not None:
             warnings.warn(report.advice, UserWarning, stacklevel=3)
-        starts = np.concatenate([self.policy.start_states, recorder.starts()])
+        starts = np.concatenate([self.policy.start_states, self.policy.factored.narrow(recorder.starts())])
         self.policy.start_states = distinct_rows(starts)[:MAX_START_STATES]
         self.policy.fitted = True
         self.goals.forget_learned()

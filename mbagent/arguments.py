@@ -3,14 +3,45 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from mbagent.exploration import EXPLORATIONS, Exploration
 from mbagent.models.base import TransitionModel
+from mbagent.planning.planner import PlannerSettings
+from mbagent.spaces import FactoredSpace
 
 MAX_SEED = 2**32 - 1
+
+
+def fitting_model(model: TransitionModel, space: FactoredSpace, n_actions: int) -> TransitionModel:
+    """A model that was given, if it is one of this environment.
+
+    Raises:
+        ValueError: it has other factors or actions.
+    """
+    if tuple(model.cardinalities) != space.cardinalities or model.n_actions != n_actions:
+        raise ValueError(
+            f"The model has {len(model.cardinalities)} factors and {model.n_actions} actions, but the environment "
+            f"{len(space)} and {n_actions}; build the model for this environment's spaces."
+        )
+    return model
+
+
+def planner_settings(own: Mapping[str, Any], policy_kwargs: Mapping[str, Any], seed: int) -> PlannerSettings:
+    """The agent's own settings of the planner and those of ``policy_kwargs``.
+
+    Raises:
+        TypeError: there is no setting of that name.
+        ValueError: one is out of range.
+    """
+    known = sorted(set(PlannerSettings.__dataclass_fields__) - {*own, "seed"})
+    unknown = sorted(set(policy_kwargs) - set(known))
+    if unknown:
+        raise TypeError(f"policy_kwargs has no {unknown[0]!r}; it takes {', '.join(known)}.")
+    return PlannerSettings(**own, seed=seed, **policy_kwargs)
 
 
 def check_seed(seed: Any) -> int | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,50 @@ from mbagent.transitions import TransitionBatch, TransitionDataset
 _FLUSH = 256
 
 
+class Experience:
+    """All transitions met, with the values of open factors (see FactoredSpace) as declared, so that none is ever lost.
+
+    Args:
+        space: the observation space, without ``values``.
+        n_actions: number of enumerated actions A.
+
+    Attributes:
+        dataset: the transitions, numbered as declared.
+    """
+
+    def __init__(self, space: FactoredSpace, n_actions: int) -> None:
+        """See the class."""
+        self.space, self.dataset = space, TransitionDataset(space.cardinalities, n_actions)
+        self._coded: tuple[FactoredSpace, int, TransitionDataset] | None = None
+
+    def coding(self) -> FactoredSpace:
+        """The space whose open factors are the values met so far, before or after a step.
+
+        Raises:
+            ValueError: a variable took too many values.
+        """
+        if not len(self.space.open):
+            return self.space
+        rows = self.dataset.rows()
+        return self.space.with_values(np.concatenate([rows.before, rows.after]))
+
+    def coded(self, space: FactoredSpace) -> TransitionDataset:
+        """The transitions in the factors of ``space``; the dataset itself where no factor is open."""
+        if space.values is None or not len(space.open):
+            return self.dataset
+        n_met = len(self.dataset)
+        if self._coded is None or self._coded[0] is not space or self._coded[1] != n_met:
+            rows, coded = self.dataset.rows(), TransitionDataset(space.cardinalities, self.dataset.n_actions)
+            coded.append(replace(rows, before=space.narrow(rows.states), after=space.narrow(rows.next_states)))
+            self._coded = (space, n_met, coded)
+        return self._coded[2]
+
+
 class ExperienceRecorder:
     """Collects the steps of ``n_envs`` environments that reset themselves, as SB3's VecEnv do.
 
     Args:
-        space: the observation space.
+        space: the observation space, without ``values``.
         dataset: where transitions go.
         n_envs: number of environments B.
 

@@ -9,6 +9,7 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from mbagent.experience import Experience
 from mbagent.planning.goal import Goal
 from mbagent.policies import PlannerPolicy
 from mbagent.rewards import GivenReward, RewardFn
@@ -37,7 +38,7 @@ class GoalBook:
 
     Args:
         policy: knows spaces and the learned reward.
-        transitions: what was met.
+        experience: what was met.
 
     Attributes:
         source: where the current goal comes from; "missing" after loading an agent whose custom reward was not given
@@ -45,9 +46,9 @@ class GoalBook:
         learned: whether the reward model is fitted to all transitions.
     """
 
-    def __init__(self, policy: PlannerPolicy, transitions: TransitionDataset) -> None:
+    def __init__(self, policy: PlannerPolicy, experience: Experience) -> None:
         """See the class."""
-        self._policy, self._transitions = policy, transitions
+        self._policy, self._experience = policy, experience
         self._custom: GivenReward | None = None
         self._environment: GivenReward | None = None
         self._since = 0
@@ -59,13 +60,24 @@ class GoalBook:
 
     def take_environment(self, env: VecEnv) -> None:
         """Takes the ``reward_fn`` of a new environment, if it has one."""
-        self._since, self._has_environment = len(self._transitions), True
+        self._since, self._has_environment = len(self._experience.dataset), True
         try:
             fn = env.get_attr("reward_fn", indices=0)[0]
         except Exception:  # a VecEnv in another process answers with whatever error pickling gives
             fn = None
         self._environment = self._given(fn) if callable(fn) else None
         self._changes_rewards, self._told = reward_wrapper(env), None
+
+    @property
+    def _transitions(self) -> TransitionDataset:
+        return self._experience.coded(self._policy.factored)
+
+    def recode(self) -> None:
+        """The policy's factors have changed."""
+        self._custom, self._environment = (
+            None if given is None else self._given(given.fn) for given in (self._custom, self._environment)
+        )
+        self.learned = False
 
     def forget_learned(self) -> None:
         """The learned reward is out of date: there are new transitions."""
@@ -94,7 +106,7 @@ class GoalBook:
         problem = self._environment_problem()
         if problem is None:
             self.source = "environment"
-            if self._changes_rewards and self._policy.fitted and len(self._transitions) == self._since:
+            if self._changes_rewards and self._policy.fitted and len(self._experience.dataset) == self._since:
                 self._tell(
                     f"{self._changes_rewards} changes the environment's rewards, which the agent has not met yet: until the next "
                     "learn() it plans with the reward_fn inside; to be sure, give the goal with set_reward(fn)."
@@ -137,7 +149,8 @@ class GoalBook:
         """Why the environment's own reward function cannot be used, or None."""
         if self._environment is None:
             return "The environment has no reward_fn" if self._has_environment else "There is no environment"
-        rows = self._transitions.rows().select(np.arange(self._since, len(self._transitions)))
+        rows = self._transitions.rows()
+        rows = rows.select(np.arange(self._since, len(rows)))
         try:
             rewards = self._environment(rows.states, rows.actions, rows.next_states)
         except Exception as error:

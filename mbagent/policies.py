@@ -41,6 +41,7 @@ class PlannerPolicy(BasePolicy):
         model: the transition model.
         reward_model: the learned reward.
         settings: see PlannerSettings.
+        factored: the observation space as factors, which the models are of; None for it as declared.
 
     Raises:
         ValueError: forecasts="direct" with another planner, or with a model that has none; a time budget or the reuse of trees
@@ -58,11 +59,12 @@ class PlannerPolicy(BasePolicy):
         model: TransitionModel,
         reward_model: LearnedReward,
         settings: PlannerSettings,
+        factored: FactoredSpace | None = None,
     ) -> None:
         """See the class."""
         super().__init__(observation_space, action_space)
         del lr_schedule
-        self.factored = FactoredSpace(observation_space)
+        self.factored = factored if factored is not None else FactoredSpace(observation_space)
         self.actions = ActionEnumeration(action_space)
         self.transition_model, self.reward_model, self.settings = model, reward_model, settings
         if settings.forecasts == "direct":
@@ -84,6 +86,18 @@ class PlannerPolicy(BasePolicy):
         """Drops every cache after new weights or start states; takes a new goal if one is given."""
         self.planner.set_model(self.transition_model, self.start_states)
         self.set_goal(goal if goal is not None else self.goal)
+
+    def parts(self) -> tuple[FactoredSpace, TransitionModel, LearnedReward, States, bool]:
+        """What is known, and in which factors; see ``recode``."""
+        return self.factored, self.transition_model, self.reward_model, self.start_states, self.fitted
+
+    def recode(
+        self, factored: FactoredSpace, model: TransitionModel, reward_model: LearnedReward, start_states: States, fitted: bool
+    ) -> None:
+        """Takes over what is known in other factors; no goal is left."""
+        self.factored, self.transition_model, self.reward_model = factored, model, reward_model
+        self.start_states, self.fitted, self.goal = start_states, fitted, None
+        self.refresh()
 
     def set_goal(self, goal: Goal | None) -> None:
         """Takes a goal (None: none is known, so ``predict`` refuses)."""
@@ -148,13 +162,14 @@ class PlannerPolicy(BasePolicy):
         return torch.as_tensor(actions)
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, torch.Tensor]:  # type: ignore[override]
-        """Weights of the transition model ("model.…") and of the learned reward ("reward.…"), as tensors."""
+        """Weights of the transition model ("model.…"), of the learned reward ("reward.…"), values of open factors ("space.…")."""
         return {name: torch.from_numpy(np.array(value)) for name, value in self.arrays().items()}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """As ``state_dict``, as numpy arrays."""
         parts = {"model": self.transition_model.state_dict(), "reward": self.reward_model.state_dict()}
-        return {f"{part}.{name}": value for part, state in parts.items() for name, value in state.items()}
+        arrays = {f"{part}.{name}": value for part, state in parts.items() for name, value in state.items()}
+        return arrays | self.factored.value_arrays()
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> None:
         """Takes weights over and drops every cache.
@@ -166,6 +181,10 @@ class PlannerPolicy(BasePolicy):
         arrays = {name: np.asarray(value) for name, value in state_dict.items()}
         if not strict:
             arrays = {**self.arrays(), **arrays}
+        own = self.factored.value_arrays()
+        if any(name in own and not np.array_equal(value, own[name]) for name, value in arrays.items()):
+            raise ValueError("These weights are of an agent that met other values; use agent.set_parameters.")
+        arrays = {name: value for name, value in arrays.items() if name not in own}
         unknown = [name for name in arrays if name.partition(".")[0] not in ("model", "reward")]
         if unknown:
             raise ValueError(f"There is no parameter called {unknown[0]!r}; take names from get_parameters()['policy'].")

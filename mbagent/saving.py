@@ -120,12 +120,23 @@ class SavableAlgorithm(BaseAlgorithm):
         params = load_path_or_dict
         if not isinstance(params, Mapping):
             params = {"policy": persistence.read(os.fspath(params))[1]["policy"]}
-        super().set_parameters(dict(params), exact_match, device)
-        cast("ModelLearningAgent", self)._refresh()
+        agent = cast("ModelLearningAgent", self)
+        before = agent.policy.parts()
+        try:
+            weights = params.get("policy", {})
+            agent._recode(agent.policy.factored.from_value_arrays({k: np.asarray(v) for k, v in dict(weights).items()}))
+            super().set_parameters(dict(params), exact_match, device)
+        except Exception:
+            if before[0] is not agent.policy.factored:
+                agent.policy.recode(*before)
+                agent.goals.recode()
+                agent._refresh()
+            raise
+        agent._refresh()
 
     def save_transitions(self, path: str) -> None:
         """Writes what was experienced as an ``.npz`` of plain arrays (see TransitionDataset.save)."""
-        cast("ModelLearningAgent", self).transitions.save(path)
+        cast("ModelLearningAgent", self).experience.dataset.save(path)
 
     def load_transitions(self, path: str) -> None:
         """Takes transitions from a file into this agent's experience; the next ``learn`` fits to them too.
@@ -134,7 +145,7 @@ class SavableAlgorithm(BaseAlgorithm):
             ValueError: they come from another kind of environment; nothing is changed then.
         """
         loaded = TransitionDataset.load(path)
-        cast("ModelLearningAgent", self).transitions.take(loaded)
+        cast("ModelLearningAgent", self).experience.dataset.take(loaded)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "policy", "transitions", "goals"]
@@ -158,7 +169,7 @@ def _save(agent: ModelLearningAgent, target: persistence.Target, include: Sequen
         agent.goals.fit_learned()
     arrays = {"policy": agent.policy.arrays(), "planning": {"start_states": agent.policy.start_states}}
     if "transitions" in include:
-        rows = agent.transitions.rows()
+        rows = agent.experience.dataset.rows()
         arrays["transitions"] = {name: getattr(rows, name) for name in rows.__dataclass_fields__}
     persistence.write(target, _data(agent), arrays)
 
@@ -248,6 +259,7 @@ def _check(data: dict[str, Any], arrays: dict[str, Any]) -> None:
 
 def _restore(agent: ModelLearningAgent, data: dict[str, Any], arrays: dict[str, Any], reward: RewardFn | None) -> None:
     policy = agent.policy
+    agent._recode(policy.factored.from_value_arrays(arrays["policy"]))
     starts = arrays["planning"]["start_states"].astype(np.int64)
     if (
         starts.ndim != 2
@@ -258,7 +270,7 @@ def _restore(agent: ModelLearningAgent, data: dict[str, Any], arrays: dict[str, 
         raise ValueError("The file's start states lie outside its observation space; it is damaged.")
     policy.start_states = starts
     if "transitions" in arrays:
-        agent.transitions.append(TransitionBatch(**arrays["transitions"]))
+        agent.experience.dataset.append(TransitionBatch(**arrays["transitions"]))
     fitted = bool(data["fitted"])
     if fitted:
         policy.transition_model.load_state_dict(_prefixed(arrays["policy"], "model."))

@@ -6,7 +6,8 @@ into *factors*: a binary variable of the paper is a factor with two values, a ``
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,11 +15,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mbagent.leaves import MAX_CARDINALITY, assemble, factor_names, leaves
+
 Factors = NDArray[np.int64]
 """Factor values, int [B, F]; factor f takes the values 0 ... cardinalities[f] - 1."""
 
-MAX_CARDINALITY = 4096
-"""More values than this in one factor is refused: no model here could learn them from data."""
+_TABLED = 1024
+"""Up to so many declared values of an open factor are looked up in a table."""
 
 MAX_ACTIONS = 4096
 """More joint actions than this is refused: planning enumerates them."""
@@ -49,50 +52,67 @@ class PlaneLayout:
         return factors.reshape(len(factors), self.channels, self.height, self.width, *rest)
 
 
-@dataclass(frozen=True)
-class _Leaf:
-    """One elementary space: its path in the nested space and how its values become factors."""
-
-    path: tuple[str | int, ...]
-    space: spaces.Space[Any]
-    low: NDArray[np.int64]
-    cardinalities: tuple[int, ...]
-    shape: tuple[int, ...]
-
-    @property
-    def name(self) -> str:
-        return ".".join(str(part) for part in self.path)
-
-
 class FactoredSpace:
     """Translates between batches of a discrete space and arrays of factors; the two directions are exact inverses.
+
+    A variable with very many declared values (a Box of more than 64, as images declare 256; else more than 4,096) is
+    *open*: only the values that are met count. Without ``values`` it is numbered as declared, which no model should be
+    given; ``with_values`` gives the space whose open factors are the values met, in order. A value that is not among them
+    is then taken for the nearest that is.
 
     Args:
         space: Discrete, MultiDiscrete, MultiBinary, integer or boolean Box, or a Dict or Tuple of these, nested at
             will.
         kind: word for error messages, "observation" or "action".
+        values: numbers of the values met by each open factor, ascending; None for all that are declared.
 
     Attributes:
         space: the space itself.
         cardinalities: number of values of each factor, length F.
         names: a readable name for each factor, length F.
+        open: the open factors, int64 [O].
+        values: as given.
         planes: the layout when the space is one stack of two-dimensional planes, else None.
 
     Raises:
         TypeError: the space holds a continuous or unsupported part; the message names it and the way out.
-        ValueError: a factor has more than ``MAX_CARDINALITY`` values.
+        ValueError: there is no variable, or one has met more than ``MAX_CARDINALITY`` values.
     """
 
-    def __init__(self, space: spaces.Space[Any], kind: str = "observation") -> None:
+    def __init__(
+        self, space: spaces.Space[Any], kind: str = "observation", values: Sequence[NDArray[np.int64]] | None = None
+    ) -> None:
         """See the class."""
         self.space = space
         self.kind = kind
-        self._leaves = list(_leaves(space, (), kind))
+        self._leaves = list(leaves(space, kind))
         if not any(leaf.cardinalities for leaf in self._leaves):
             raise ValueError(f"The {kind} space {space} holds no variable; there is nothing to learn about.")
-        self.cardinalities: tuple[int, ...] = tuple(c for leaf in self._leaves for c in leaf.cardinalities)
-        self.names: tuple[str, ...] = tuple(_factor_names(self._leaves, kind))
+        cardinalities = [c for leaf in self._leaves for c in leaf.cardinalities]
+        self.open = np.flatnonzero([leaf.open for leaf in self._leaves for _ in leaf.cardinalities]).astype(np.int64)
+        self.names: tuple[str, ...] = tuple(factor_names(self._leaves, kind))
         self.planes = _plane_layout(space)
+        self.values = None if values is None else tuple(np.asarray(each, dtype=np.int64) for each in values)
+        self._nearest: NDArray[np.int64] | None = None
+        if self.values is not None and len(self.open):
+            self._count_only(self.values, cardinalities)
+        self.cardinalities: tuple[int, ...] = tuple(cardinalities)
+
+    def _count_only(self, values: tuple[NDArray[np.int64], ...], cardinalities: list[int]) -> None:
+        """Gives open factors the values met; where few are declared, with a table of the nearest to look up."""
+        declared = max(cardinalities[factor] for factor in self.open)
+        for factor, known in zip(self.open, values, strict=True):
+            if len(known) > MAX_CARDINALITY:
+                raise ValueError(
+                    f"The {self.kind}'s variable {self.names[factor]!r} took {len(known)} values, more than {MAX_CARDINALITY}; "
+                    "make them fewer in a gymnasium.ObservationWrapper, or see them as bits with mbagent.wrappers.Bits."
+                )
+            cardinalities[factor] = len(known)
+        most = max(map(len, values))
+        self._known = np.stack([np.pad(known, (0, most - len(known)), mode="edge") for known in values])
+        tabled = values if declared <= _TABLED else ()
+        rows = [_nearest(known, np.arange(declared)) for known in tabled]
+        self._nearest = np.array(rows, dtype=np.int64).reshape(len(rows), declared if rows else 0)
 
     def __len__(self) -> int:
         """Number of factors F."""
@@ -111,27 +131,7 @@ class FactoredSpace:
         Raises:
             ValueError: a value lies outside the space, or the shape does not fit; the message says which part.
         """
-        columns = []
-        for leaf in self._leaves:
-            values = np.asarray(_descend(batch, leaf.path, self.kind))
-            if values.shape[1:] != leaf.shape or values.ndim == 0:
-                raise ValueError(
-                    f"The {self.kind} batch{_at(leaf)} has shape {values.shape}, but {leaf.space} needs "
-                    f"(batch, {', '.join(map(str, leaf.shape))}); pass a batch of {self.kind}s of the environment's space."
-                )
-            flat = values.reshape(len(values), len(leaf.cardinalities))
-            if flat.dtype.kind not in "iub" and not np.array_equal(flat, np.floor(flat)):
-                raise ValueError(f"The {self.kind}{_at(leaf)} holds values that are not whole numbers; {leaf.space} has none.")
-            factors = flat.astype(np.int64) - leaf.low
-            outside = (factors < 0) | (factors >= np.asarray(leaf.cardinalities))
-            if outside.any():
-                bad = flat[outside][0]
-                raise ValueError(
-                    f"The {self.kind}{_at(leaf)} holds the value {bad}, which lies outside {leaf.space}; "
-                    f"pass {self.kind}s of the environment's own space."
-                )
-            columns.append(factors)
-        return np.concatenate(columns, axis=1)
+        return self.narrow(np.concatenate([leaf.encode(batch, self.kind) for leaf in self._leaves], axis=1))
 
     def decode(self, factors: NDArray[Any]) -> Any:
         """The batch, laid out as ``batch_space`` does and in the space's own data types, that [B, F] factors stand for."""
@@ -143,16 +143,82 @@ class FactoredSpace:
 
     def _decode(self, factors: NDArray[Any], integers: bool) -> Any:
         parts: dict[tuple[str | int, ...], NDArray[Any]] = {}
-        start = 0
+        start, numbers = 0, self.widen(factors)
         for leaf in self._leaves:
             stop = start + len(leaf.cardinalities)
-            values = factors[:, start:stop].astype(np.int64)  # a copy: what is made of it may be changed
-            if leaf.low.any():
-                values += leaf.low
-            dtype = np.dtype(np.int64) if integers else np.dtype(leaf.space.dtype)
-            parts[leaf.path] = values.reshape(len(factors), *leaf.shape).astype(dtype, copy=False)
+            parts[leaf.path] = leaf.decode(numbers[:, start:stop].astype(np.int64), integers)  # a copy, which may be changed
             start = stop
-        return _assemble(self.space, (), parts)
+        return assemble(self.space, parts)
+
+    def with_values(self, numbers: NDArray[Any]) -> FactoredSpace:
+        """The space whose open factors are the values met.
+
+        Args:
+            numbers: what was met, int [N, F], numbered as declared; the lowest values where N is 0.
+
+        Raises:
+            ValueError: a variable took more than ``MAX_CARDINALITY`` values.
+        """
+        if not len(self.open):
+            return self
+        rows = numbers if len(numbers) else np.zeros((1, len(self)), dtype=np.int64)
+        met = {int(factor): np.unique(rows[:, factor]) for factor in self.open}
+        if self.planes is not None and len(met) == len(self):  # a plane's cells have the same values, so that they can share
+            for plane in self.planes.to_planes(np.arange(len(self))[None])[0]:
+                together = np.unique(np.concatenate([met[int(factor)] for factor in plane.ravel()]))
+                met |= dict.fromkeys(plane.ravel().tolist(), together)
+        return FactoredSpace(self.space, self.kind, [met[int(factor)] for factor in self.open])
+
+    def same_factors(self, other: FactoredSpace) -> bool:
+        """Whether the factors of both have the same values."""
+        own, others = self.value_arrays(), other.value_arrays()
+        return own.keys() == others.keys() and all(np.array_equal(own[name], others[name]) for name in own)
+
+    def value_arrays(self) -> dict[str, NDArray[np.int64]]:
+        """The open factors' values as arrays, "space.values" one after the other and how many each has; empty without any."""
+        if self._nearest is None or self.values is None:
+            return {}
+        return {"space.values": np.concatenate(self.values), "space.counts": np.array([len(known) for known in self.values])}
+
+    def from_value_arrays(self, arrays: Mapping[str, NDArray[Any]]) -> FactoredSpace:
+        """The space whose ``value_arrays`` these are; this one, where there are none among them.
+
+        Raises:
+            ValueError: they are of another space.
+        """
+        if "space.values" not in arrays or "space.counts" not in arrays:
+            return self
+        values, counts = (np.asarray(arrays[name]) for name in ("space.values", "space.counts"))
+        if len(counts) != len(self.open) or counts.sum() != len(values) or (counts < 1).any():
+            raise ValueError("The values of open variables are those of another observation space.")
+        return FactoredSpace(self.space, self.kind, np.split(values, np.cumsum(counts)[:-1]))
+
+    def narrow(self, numbers: NDArray[np.int64]) -> Factors:
+        """Factors int64 [B, F] of numbers as declared: the nearest of the values met, the lower of two."""
+        if self._nearest is None:
+            return numbers
+        factors = numbers.copy()
+        if len(self._nearest):
+            factors[:, self.open] = self._nearest[np.arange(len(self.open)), numbers[:, self.open]]
+            return factors
+        for factor, known in zip(self.open, self.values or (), strict=True):
+            factors[:, factor] = _nearest(known, numbers[:, factor])
+        return factors
+
+    def widen(self, factors: NDArray[Any]) -> NDArray[Any]:
+        """Numbers as declared, int [B, F], of factors."""
+        if self._nearest is None:
+            return factors
+        numbers = factors.astype(np.int64)
+        numbers[:, self.open] = self._known[np.arange(len(self.open)), factors[:, self.open]]
+        return numbers
+
+
+def _nearest(known: NDArray[np.int64], numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Which of ``known``, ascending, is nearest to each number; the lower of two."""
+    above = np.minimum(np.searchsorted(known, numbers), len(known) - 1)
+    below = np.maximum(above - 1, 0)
+    return np.where(np.abs(numbers - known[below]) <= np.abs(known[above] - numbers), below, above)
 
 
 class ActionEnumeration:
@@ -178,10 +244,11 @@ class ActionEnumeration:
                 "make it one MultiDiscrete in a gymnasium.ActionWrapper."
             )
         self.factored = FactoredSpace(space, kind="action")
-        self.n = int(np.prod([float(c) for c in self.factored.cardinalities]))
+        self.n = math.prod(self.factored.cardinalities)
         if self.n > MAX_ACTIONS:
+            many = f"{self.n:,}" if self.n < 10**12 else f"about 10^{len(str(self.n)) - 1}"
             raise ValueError(
-                f"The action space {space} has {self.n} joint actions, more than the {MAX_ACTIONS} that planning can "
+                f"The action space {space} has {many} joint actions, more than the {MAX_ACTIONS:,} that planning can "
                 "enumerate; merge or drop actions in a gymnasium.ActionWrapper."
             )
 
@@ -205,62 +272,6 @@ class ActionEnumeration:
         return np.stack(np.unravel_index(np.asarray(indices), self.factored.cardinalities), axis=1).astype(np.int64)
 
 
-def _leaves(space: spaces.Space[Any], path: tuple[str | int, ...], kind: str) -> Iterator[_Leaf]:
-    if isinstance(space, spaces.Dict):
-        for key, part in space.spaces.items():
-            yield from _leaves(part, (*path, key), kind)
-        return
-    if isinstance(space, spaces.Tuple):
-        for index, part in enumerate(space.spaces):
-            yield from _leaves(part, (*path, index), kind)
-        return
-    low, sizes = _value_range(space, path, kind)
-    shape = tuple(space.shape or ())
-    too_many = [size for size in sizes if size > MAX_CARDINALITY]
-    if too_many:
-        raise ValueError(
-            f"The {kind} space's part {space} has a variable with {too_many[0]} values, more than {MAX_CARDINALITY}; "
-            "narrow its range in a gymnasium.ObservationWrapper."
-        )
-    yield _Leaf(path, space, low, tuple(sizes), shape)
-
-
-def _value_range(space: spaces.Space[Any], path: tuple[str | int, ...], kind: str) -> tuple[NDArray[np.int64], list[int]]:
-    """Lowest value [n] and number of values [n] of each variable of an elementary space."""
-    if isinstance(space, spaces.Discrete):
-        return np.array([int(space.start)], dtype=np.int64), [int(space.n)]
-    if isinstance(space, spaces.MultiDiscrete):
-        return space.start.ravel().astype(np.int64), [int(n) for n in space.nvec.ravel()]
-    if isinstance(space, spaces.MultiBinary):
-        n = int(np.prod(space.shape))
-        return np.zeros(n, dtype=np.int64), [2] * n
-    where = f" part {'.'.join(map(str, path))!r}" if path else ""
-    if isinstance(space, spaces.Box) and kind == "observation":
-        if space.dtype is not None and np.dtype(space.dtype).kind in "iub":
-            bounds = zip(space.low.ravel().tolist(), space.high.ravel().tolist(), strict=True)  # Python's integers: no overflow
-            return space.low.ravel().astype(np.int64), [int(high) - int(low) + 1 for low, high in bounds]
-        raise TypeError(
-            f"The observation space{where} {space} is continuous, and this agent models discrete variables; "
-            "wrap the environment with gymnasium.wrappers.DiscretizeObservation (a Box with finite bounds; clip others first)."
-        )
-    way_out = " wrap the environment with gymnasium.wrappers.DiscretizeAction." if kind == "action" else ""
-    raise TypeError(
-        f"The {kind} space{where} {space} is not discrete: Discrete, MultiDiscrete, MultiBinary"
-        f"{', integer Box, Dict and Tuple' if kind == 'observation' else ''} are supported;"
-        f"{way_out or ' convert it in a gymnasium.ObservationWrapper.'}"
-    )
-
-
-def _factor_names(leaves: Sequence[_Leaf], kind: str) -> Iterator[str]:
-    for leaf in leaves:
-        base = leaf.name or kind
-        if len(leaf.cardinalities) == 1 and not leaf.shape:
-            yield base
-            continue
-        for index in np.ndindex(*leaf.shape):
-            yield f"{base}[{','.join(map(str, index))}]"
-
-
 def _plane_layout(space: spaces.Space[Any]) -> PlaneLayout | None:
     """The layout if ``space`` is one stack of planes: two or three dimensions, cells at least 3 by 3.
 
@@ -280,24 +291,3 @@ def _plane_layout(space: spaces.Space[Any]) -> PlaneLayout | None:
         return None
     channels, height, width = (shape[2], shape[0], shape[1]) if last else shape
     return PlaneLayout(channels, height, width, last) if min(height, width) >= 3 else None
-
-
-def _at(leaf: _Leaf) -> str:
-    return f" part {leaf.name!r}" if leaf.path else ""
-
-
-def _descend(batch: Any, path: tuple[str | int, ...], kind: str) -> Any:
-    for key in path:
-        missing = isinstance(batch, Mapping) and key not in batch
-        if missing or not isinstance(batch, Mapping | Sequence):
-            raise ValueError(f"The {kind} batch has no part {key!r}; pass batched leaves for every part of the space.")
-        batch = batch[key]  # type: ignore[index]  # a str for a Mapping, an int for a Sequence
-    return batch
-
-
-def _assemble(space: spaces.Space[Any], path: tuple[str | int, ...], parts: Mapping[Any, NDArray[Any]]) -> Any:
-    if isinstance(space, spaces.Dict):
-        return {key: _assemble(part, (*path, key), parts) for key, part in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
-        return tuple(_assemble(part, (*path, index), parts) for index, part in enumerate(space.spaces))
-    return parts[path]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -10,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mbagent.leaves import MAX_DECLARED
 from mbagent.spaces import ActionEnumeration, FactoredSpace
 
 
@@ -88,9 +90,90 @@ class History(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
         return shown
 
 
-def _space_of(cardinalities: NDArray[np.int64]) -> spaces.MultiBinary | spaces.MultiDiscrete[Any]:
-    """The space of variables with so many values each."""
-    return spaces.MultiBinary(cardinalities.shape) if (cardinalities == 2).all() else spaces.MultiDiscrete(cardinalities)
+class Flat(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArgs):
+    """Makes an observation of parts within parts one Dict of all elementary parts.
+
+    SB3's vector environments carry Dicts and Tuples, but none inside another. A part's key is the path to it with dots
+    between ("robot.arm", "sensors.0"); an observation that is not nested becomes a Dict of one part, "obs".
+
+    Args:
+        env: an environment with any observation space of Dicts and Tuples.
+
+    Raises:
+        ValueError: two paths have the same key.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        """See the class."""
+        gym.utils.RecordConstructorArgs.__init__(self)
+        gym.ObservationWrapper.__init__(self, env)
+        parts = dict(_parts(env.observation_space))
+        self._keys = {path: ".".join(map(str, path)) or "obs" for path in parts}
+        if len(set(self._keys.values())) < len(parts):
+            twice = next(key for key in self._keys.values() if list(self._keys.values()).count(key) > 1)
+            raise ValueError(f"Two parts of the observation would be called {twice!r}; rename one in an ObservationWrapper.")
+        self.observation_space = spaces.Dict({self._keys[path]: part for path, part in parts.items()})
+
+    def observation(self, observation: Any) -> dict[str, Any]:
+        """The flat observation."""
+        found = {}
+        for path, key in self._keys.items():
+            part = observation
+            for step in path:
+                part = part[step]
+            found[key] = part
+        return found
+
+
+class Bits(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArgs):
+    """Makes an observation that is one large number its binary digits, the highest first.
+
+    For a ``Discrete`` of very many values whose digits mean something each, as where a simulator packs flags into one
+    number: a model can then learn each bit by itself. Where they mean nothing, leave the number as it is.
+
+    Args:
+        env: an environment whose observation space is Discrete.
+
+    Raises:
+        TypeError: it is not.
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        """See the class."""
+        gym.utils.RecordConstructorArgs.__init__(self)
+        gym.ObservationWrapper.__init__(self, env)
+        if not isinstance(env.observation_space, spaces.Discrete):
+            raise TypeError(f"Bits needs a Discrete observation space, got {env.observation_space}.")
+        self._low, n = int(env.observation_space.start), int(env.observation_space.n)
+        self._shifts = np.arange(max(1, (n - 1).bit_length()))[::-1]
+        self.observation_space = spaces.MultiBinary(len(self._shifts))
+
+    def observation(self, observation: Any) -> NDArray[np.int8]:
+        """The number's digits, int8 [bits]."""
+        return ((int(observation) - self._low) >> self._shifts & 1).astype(np.int8)
+
+    def number(self, bits: NDArray[Any]) -> NDArray[np.int64]:
+        """The numbers [...] that digits [..., bits] stand for; the inverse of ``observation``."""
+        weighed: NDArray[np.int64] = (np.asarray(bits, dtype=np.int64) << self._shifts).sum(axis=-1) + self._low
+        return weighed
+
+
+def _parts(space: spaces.Space[Any], path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], spaces.Space[Any]]]:
+    """The elementary spaces inside a space, with the paths to them."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        for key, part in space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces):
+            yield from _parts(part, (*path, key))
+    else:
+        yield path, space
+
+
+def _space_of(cardinalities: NDArray[np.int64]) -> spaces.MultiBinary | spaces.MultiDiscrete[Any] | spaces.Box:
+    """The space of variables with so many values each; a Box where those are no more than declared (see FactoredSpace)."""
+    if (cardinalities == 2).all():
+        return spaces.MultiBinary(cardinalities.shape)
+    if cardinalities.max() <= MAX_DECLARED:
+        return spaces.MultiDiscrete(cardinalities)
+    return spaces.Box(np.zeros_like(cardinalities), cardinalities - 1, dtype=np.int64)
 
 
 def _batch(value: Any) -> Any:

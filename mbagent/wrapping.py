@@ -16,7 +16,7 @@ def wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> Vec
     """As SB3 wraps environments, but without moving the channels of image-like observations.
 
     Raises:
-        TypeError: the observation space is nested deeper than SB3's vector environments can carry.
+        TypeError: the observation space is nested deeper than SB3's vector environments can carry; see wrappers.Flat.
     """
     if not isinstance(env, VecEnv):
         env = _patch_env(env)
@@ -39,5 +39,5 @@ def _refuse_nested(space: spaces.Space[object]) -> None:
     if any(isinstance(part, spaces.Dict | spaces.Tuple) for part in parts):
         raise TypeError(
             "The observation space is nested (a Dict or Tuple inside another), which SB3's vector environments cannot carry; "
-            "flatten it by one level in a gymnasium.ObservationWrapper."
+            "wrap the environment: mbagent.wrappers.Flat(env)."
         )

@@ -40,6 +40,7 @@ def test_files_and_functions_stay_short(path: Path) -> None:
         ("envs", ("mbagent",)),
         ("mbagent/models", ("mbagent.planning", "mbagent.agent", "mbagent.analysis")),
         ("mbagent/planning", ("mbagent.agent", "mbagent.analysis")),
+        ("mbagent/adapters", ("mbagent.models", "mbagent.planning", "mbagent.agent", "mbagent.analysis")),
     ],
 )
 def test_data_flows_one_way(folder: str, forbidden: tuple[str, ...]) -> None:

@@ -1,0 +1,44 @@
+"""What the documentation shows works."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+
+PAGE = Path(__file__).parents[1] / "docs" / "environments.md"
+
+
+def blocks() -> list[str]:
+    """The page's Python, but for what is marked not to be run."""
+    return re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+
+
+def mean_return(agent: Any, env: gym.Env[Any, Any], episodes: int) -> float:
+    total = 0.0
+    for seed in range(episodes):
+        obs, _ = env.reset(seed=seed)
+        done = False
+        while not done:
+            obs, reward, terminated, truncated, _ = env.step(agent.predict(obs)[0])
+            total += float(reward)
+            done = terminated or truncated
+    return total / episodes
+
+
+@pytest.mark.filterwarnings("ignore:.*History", "ignore:.*reward_fn")  # bins are not the whole state, and the agent says so
+def test_continuous_variables_are_cut_into_bins() -> None:
+    cart_pole, mountain_car = blocks()
+    names: dict[str, Any] = {}
+    exec(cart_pole.replace("20_000", "4_000"), names)
+    assert mean_return(names["agent"], names["cart_pole"](), 3) > 60  # random play: 22
+    exec(mountain_car.replace("20_000", "8_000").replace("(30, 30)", "(20, 20)"), names)
+    assert names["agent"].transitions.rows().terminated.any()
+    assert mean_return(names["agent"], names["mountain_car"](), 2) > -200  # it gets there in time
+
+
+@pytest.mark.parametrize("link", re.findall(r"`mbagent\.([a-z_.]+\.[A-Za-z_]+)", PAGE.read_text(encoding="utf-8")))
+def test_every_name_exists(link: str) -> None:
+    module, _, name = link.rpartition(".")
+    assert hasattr(pytest.importorskip(f"mbagent.{module}"), name)
