@@ -10,6 +10,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from mbagent.experience import Experience
+from mbagent.learned_reward import RewardReport
 from mbagent.planning.goal import Goal
 from mbagent.policies import PlannerPolicy
 from mbagent.rewards import GivenReward, RewardFn
@@ -44,6 +45,7 @@ class GoalBook:
         source: where the current goal comes from; "missing" after loading an agent whose custom reward was not given
             again.
         learned: whether the reward model is fitted to all transitions.
+        reward_report: how well it tells rewards; None before it is fitted.
     """
 
     def __init__(self, policy: PlannerPolicy, experience: Experience) -> None:
@@ -57,6 +59,7 @@ class GoalBook:
         self._told: str | None = None
         self.source: Source = "environment"
         self.learned = False
+        self.reward_report: RewardReport | None = None
 
     def take_environment(self, env: VecEnv) -> None:
         """Takes the ``reward_fn`` of a new environment, if it has one."""
@@ -142,7 +145,9 @@ class GoalBook:
         rows = self._transitions.rows()
         if not self.learned and len(rows):
             recent = np.arange(self._since if self._since < len(rows) else 0, len(rows))
-            self._policy.reward_model.fit(rows.select(recent))
+            self.reward_report = self._policy.reward_model.fit(rows.select(recent))
+            if self.reward_report.advice is not None:
+                warnings.warn(self.reward_report.advice, UserWarning, stacklevel=2)
             self.learned = True
 
     def _environment_problem(self) -> str | None:

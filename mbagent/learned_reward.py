@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from torch.nn import functional
 from mbagent.models.base import Actions, Floats, States, hash_rows
 from mbagent.models.networks import Affine, FactorCodec
 from mbagent.models.planes import Convolution, cells_of
+from mbagent.models.reward_kernel import DenseReward, pack_reward, reward_outputs
 from mbagent.models.training import one_thread
 from mbagent.spaces import PlaneLayout
 from mbagent.transitions import TransitionBatch
@@ -22,7 +24,48 @@ MAX_CLASSES = 64
 """Up to this many distinct rewards are told apart as classes; more are met by regression."""
 
 STEPS, BATCH, LEARNING_RATE = 1500, 256, 0.01
+
+HELD_OUT = 0.15
+"""Share of episodes held out at first."""
+
 _CHUNK = 256
+
+
+ADVISED_AT = 0.02
+"""Share of transitions with contrary rewards, or of held-out ones with a wrong reward, from which the agent says so."""
+
+
+@dataclass(frozen=True)
+class RewardReport:
+    """How well rewards can be told.
+
+    Attributes:
+        n_values: how many distinct rewards were met.
+        right: share of transitions whose reward comes out within 0.5% of the range.
+        held_out: the same of episodes that were held out at first, as measured then; NaN where there are none.
+        contrary: share of transitions that had another reward than most with the same (observation, action, next observation).
+    """
+
+    n_values: int
+    right: float
+    held_out: float
+    contrary: float
+
+    @property
+    def advice(self) -> str | None:
+        """What a user should know, in a sentence; None where all is well."""
+        if self.contrary > ADVISED_AT:
+            return (
+                f"{self.contrary:.1%} of rewards differ from what the same observation, action and next observation earned "
+                "before, so the reward is random or hangs on what is not observed (time, history); the agent plans with means. "
+                "mbagent.wrappers.History may show what is missing."
+            )
+        if self.held_out < 1.0 - ADVISED_AT:
+            return (
+                f"The learned reward is right in only {self.held_out:.1%} of the transitions of held-out episodes: learn from "
+                "more steps, or give the agent a reward function (set_reward)."
+            )
+        return None
 
 
 class LearnedReward:
@@ -49,23 +92,35 @@ class LearnedReward:
         if self._planes is not None:
             self._network = _PlaneReward(self._codec, self._planes, n_out, generator)
         else:
-            self._network = _DenseReward(self._codec, n_out, generator)
+            self._network = DenseReward(self._codec, n_out, generator)
+        self._compile()
 
     @one_thread()
-    def fit(self, rows: TransitionBatch) -> float:
-        """Learns from rows; returns the share of them whose reward comes out right (within 0.5% of the range)."""
+    def fit(self, rows: TransitionBatch) -> RewardReport:
+        """Learns from rows: from most episodes first, to see how it does on the others, and then from all."""
         values = np.unique(rows.rewards)
         self._classes = len(values) <= MAX_CLASSES
         self._values = values if self._classes else np.array([values.mean(), max(values.std(), 1e-6)])
         self._build()
-        distinct, weights = _distinct(rows)
+        held_out, (distinct, weights) = float("nan"), _distinct(rows)
         if len(values) > 1:
-            self._train(distinct, torch.from_numpy(weights))
-        got = self(distinct.states, distinct.actions, distinct.next_states)
-        close = np.abs(got - distinct.rewards) <= 0.005 * max(float(np.ptp(values)), 1e-12)
+            episodes = np.unique(rows.episodes)
+            chosen = np.random.default_rng(self._seed).permutation(episodes)[: int(HELD_OUT * len(episodes))]
+            held = np.isin(rows.episodes, chosen)
+            if held.any():
+                first, first_weights = _distinct(rows.select(np.flatnonzero(~held)))
+                self._train(first, torch.from_numpy(first_weights), STEPS)
+                held_out = self._share_right(rows.select(np.flatnonzero(held)))
+            self._train(distinct, torch.from_numpy(weights), STEPS // 2 if held.any() else STEPS)
+        right = self._share_right(distinct, weights)
+        return RewardReport(len(values), right, held_out, _contrary(rows))
+
+    def _share_right(self, rows: TransitionBatch, weights: NDArray[np.float32] | None = None) -> float:
+        reach = float(np.ptp(self._values)) if self._classes else 6.0 * float(self._values[1])
+        close = np.abs(self(rows.states, rows.actions, rows.next_states) - rows.rewards) <= 0.005 * max(reach, 1e-12)
         return float(np.average(close, weights=weights))
 
-    def _train(self, rows: TransitionBatch, weights: Tensor) -> None:
+    def _train(self, rows: TransitionBatch, weights: Tensor, steps: int) -> None:
         states, actions, next_states = (torch.from_numpy(part) for part in (rows.states, rows.actions, rows.next_states))
         if self._classes:
             targets = torch.from_numpy(np.searchsorted(self._values, rows.rewards))
@@ -73,9 +128,9 @@ class LearnedReward:
             targets = torch.from_numpy((rows.rewards - self._values[0]) / self._values[1]).float()
         generator = torch.Generator().manual_seed(self._seed + 1)
         optimizer = torch.optim.Adam(self._network.parameters(), lr=LEARNING_RATE)
-        for step in range(STEPS):
+        for step in range(steps):
             for group in optimizer.param_groups:
-                group["lr"] = LEARNING_RATE * min(1.0, 2.0 * (1.0 - step / STEPS))
+                group["lr"] = LEARNING_RATE * min(1.0, 2.0 * (1.0 - step / steps))
             i = torch.randint(len(actions), (min(BATCH, len(actions)),), generator=generator)
             out = self._network(states[i], actions[i], next_states[i])
             if self._classes:
@@ -85,6 +140,11 @@ class LearnedReward:
             optimizer.zero_grad(set_to_none=True)
             (losses * weights[i]).mean().backward()  # type: ignore[no-untyped-call]
             optimizer.step()
+        self._compile()
+
+    def _compile(self) -> None:
+        """Packs the present weights for compiled code, where there is a kernel for the network."""
+        self._packed = pack_reward(self._network) if isinstance(self._network, DenseReward) else None
 
     @one_thread()
     @torch.inference_mode()
@@ -92,6 +152,8 @@ class LearnedReward:
         """Expected rewards float64 [M]; a row's value does not depend on the rows beside it."""
         if len(self._values) == 1:
             return np.full(len(actions), self._values[0])
+        if self._packed is not None:
+            return self._expected(torch.from_numpy(reward_outputs(self._packed, states, actions, next_states))).numpy()
         parts = [np.zeros(0)]
         for start in range(0, len(actions), _CHUNK):
             rows = [np.ascontiguousarray(part[start : start + _CHUNK]) for part in (states, actions, next_states)]
@@ -107,7 +169,8 @@ class LearnedReward:
             return out[:, 0].double() * float(self._values[1]) + float(self._values[0])
         p = out.double().softmax(dim=1)
         p = torch.where(p < 0.01, 0.0, p)
-        return (p / p.sum(dim=1, keepdim=True)) @ torch.from_numpy(self._values)
+        # Not a matrix product: it would round differently for other numbers of rows.
+        return (p / p.sum(dim=1, keepdim=True) * torch.from_numpy(self._values)).sum(dim=1)
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """All weights, as arrays."""
@@ -121,23 +184,7 @@ class LearnedReward:
         prefix = "network."
         weights = {k.removeprefix(prefix): torch.tensor(np.asarray(v)) for k, v in state.items() if k.startswith(prefix)}
         self._network.load_state_dict(weights)
-
-
-class _DenseReward(nn.Module):
-    """One hidden layer over state, action and next state."""
-
-    def __init__(self, codec: FactorCodec, n_out: int, generator: torch.Generator) -> None:
-        super().__init__()
-        self.codec = codec
-        self.first = Affine(codec.n_inputs + codec.n_state_columns, 64, generator)
-        self.out = Affine(64, n_out, generator)
-
-    def forward(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
-        """Class logits or a normalised reward [B, n_out]."""
-        after = self.codec.inputs(next_states, actions)[:, : self.codec.n_state_columns]
-        hidden = functional.relu(self.first(torch.cat((self.codec.inputs(states, actions), after), dim=1)))
-        result: Tensor = self.out(hidden)
-        return result
+        self._compile()
 
 
 class _PlaneReward(nn.Module):
@@ -168,9 +215,21 @@ def _distinct(rows: TransitionBatch) -> tuple[TransitionBatch, NDArray[np.float3
 
     A rare transition then counts as much as a frequent one, and a random reward keeps its distribution.
     """
-    triples = hash_rows(np.concatenate([rows.states, rows.actions[:, None], rows.next_states], axis=1))
-    bits = np.ascontiguousarray(rows.rewards).view(np.int64)
-    _, first, counts = np.unique(np.stack([triples.view(np.int64), bits], axis=1), axis=0, return_index=True, return_counts=True)
+    triples, bits = _triples(rows), np.ascontiguousarray(rows.rewards).view(np.int64)
+    _, first, counts = np.unique(np.stack([triples, bits], axis=1), axis=0, return_index=True, return_counts=True)
     _, inverse = np.unique(triples[first], return_inverse=True)
     shares = counts / np.bincount(inverse, weights=counts)[inverse]
     return rows.select(first), shares.astype(np.float32)
+
+
+def _triples(rows: TransitionBatch) -> NDArray[np.int64]:
+    """A number for each (s, a, s')."""
+    return hash_rows(np.concatenate([rows.states, rows.actions[:, None], rows.next_states], axis=1)).view(np.int64)
+
+
+def _contrary(rows: TransitionBatch) -> float:
+    """Share of rows with another reward than the commonest of the same (s, a, s')."""
+    bits = np.ascontiguousarray(rows.rewards, dtype=np.float64).view(np.int64)
+    pairs, counts = np.unique(np.stack([_triples(rows), bits], axis=1), axis=0, return_counts=True)
+    first = np.flatnonzero(np.r_[True, pairs[1:, 0] != pairs[:-1, 0]])
+    return 1.0 - float(np.maximum.reduceat(counts, first).sum()) / len(rows.actions)
