@@ -27,6 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mbagent.analysis.folders import replaced, set_aside
+from mbagent.analysis.planning_benchmark.crowds import WORLDS, compare_values
 from mbagent.analysis.planning_benchmark.latency import SETTINGS, steady
 from mbagent.analysis.planning_benchmark.latency import measure as measure_latency
 from mbagent.analysis.planning_benchmark.network_search import EFFORTS, measure_own, ratios, rows_of_mctx
@@ -41,7 +42,7 @@ from mbagent.analysis.planning_benchmark.start import GAMES, first_decision
 
 Rows = list[dict[str, Any]]
 Say = Callable[[str], None]
-PARTS = ("quality", "decisions", "start", "memory", "regret", "naive", "short cut", "networks")
+PARTS = ("quality", "crowds", "decisions", "start", "memory", "regret", "naive", "short cut", "networks")
 
 
 @dataclass(frozen=True)
@@ -49,8 +50,8 @@ class Args:
     """Measure planning and sampling."""
 
     parts: tuple[str, ...] = PARTS
-    """What to measure: quality of play, cost of decisions, start of a process, memory, regret (and speed of searches), naive,
-    short cut, networks."""
+    """What to measure: quality of play (crowds: among many noisy variables), cost of decisions, start of a process, memory,
+    regret (and speed of searches), naive, short cut, networks."""
     full: bool = False
     """5 agents of each kind, learned ones too, instead of 1 with the true model."""
     peers_python: Path | None = None
@@ -81,6 +82,16 @@ def measure_quality(args: Args, say: Say) -> dict[str, Rows]:
             say(f"{key}, {'learned' if learned else 'true'} model")
             rows.append(summary([play_game(key, seed, learned, scale) for seed in seeds]))
     return {"quality": rows}
+
+
+def measure_crowds(args: Args, say: Say) -> dict[str, Rows]:
+    """Planning among many noisy variables, without and with values learned in imagination."""
+    rows: Rows = []
+    for make in WORLDS:
+        world = make()
+        say(f"crowds: {world.name}")
+        rows += compare_values(world, args.first_seed + 1000)
+    return {"crowds": rows}
 
 
 def measure_decisions(args: Args, say: Say) -> dict[str, Rows]:
@@ -162,6 +173,7 @@ def measure_networks(args: Args, say: Say) -> dict[str, Rows]:
 
 _MEASURES: dict[str, Callable[[Args, Say], dict[str, Rows]]] = {
     "quality": measure_quality,
+    "crowds": measure_crowds,
     "decisions": measure_decisions,
     "start": measure_start,
     "memory": measure_memory,

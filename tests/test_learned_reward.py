@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from mbagent.learned_reward import LearnedReward
 from mbagent.models.networks import FactorCodec
@@ -48,9 +49,10 @@ def test_a_function_of_the_transition_is_learned_and_found_right_in_held_out_epi
 def test_rewards_that_hang_on_something_else_are_reported() -> None:
     data = rows(4000)
     hidden = np.random.default_rng(5).random(4000) < 0.3
-    states = data.states * [1, 0, 0, 0]  # few distinct transitions, so that the same ones come back
-    after = data.next_states * [1, 0, 0, 0]
-    report = LearnedReward((2,) * 4, 3).fit(replace(data, states=states, next_states=after, rewards=data.rewards + hidden))
+    kept = np.array([1, 0, 0, 0], dtype=np.int64)
+    states: NDArray[np.int64] = data.states * kept  # few distinct transitions, so that the same ones come back
+    after: NDArray[np.int64] = data.next_states * kept
+    report = LearnedReward((2,) * 4, 3).fit(replace(data, before=states, after=after, rewards=data.rewards + hidden))
     assert report.contrary == pytest.approx(0.3, abs=0.03)
     assert report.advice is not None
     assert "hangs on what is not observed" in report.advice

@@ -17,6 +17,7 @@ Row: TypeAlias = Mapping[str, Any]
 
 TITLES = {
     "quality": "How well agents play with the default settings",
+    "crowds": "Worlds of many noisy variables, too large to solve",
     "decisions": "What a decision costs beside a forward pass of PPO",
     "start": "The first decision of a new process",
     "memory": "Memory over many decisions",
@@ -32,6 +33,8 @@ TITLES = {
 NOTES = {
     "quality": "Normalised return: 0 random play, 1 the optimum or the best player known; interquartile mean over agents and "
     "episodes, with its bootstrap interval. Of tables the exact value of what the agent does.",
+    "crowds": "Return of 40 steps, true rules, mean over 16 episodes with its standard error; lookahead: the default planner "
+    "without learned values. What is done once for a goal is timed apart.",
     "decisions": "Median processor time on one core about single observations, none met twice. The reward is the game's own, or "
     "the same as a plain Python function; what is done once for a goal (the reachable machine, if it is small) is timed apart.",
     "start": "Processor time in a new process, after imports, with everything compiled by an earlier one. The first decision "
