@@ -40,6 +40,10 @@ def _check_signature(fn: Any) -> None:
         raise TypeError(f"A reward function is called as fn(obs, action, next_obs), but {fn!r} takes {signature}.") from error
 
 
+LARGEST_REWARD = 1e100
+"""Largest absolute reward: what is planned with adds, multiplies and squares them."""
+
+
 class GivenReward:
     """A user's or an environment's reward function, as a goal on factors.
 
@@ -96,4 +100,9 @@ class GivenReward:
             )
         if not np.isfinite(rewards).all():
             raise ValueError("The reward function returned NaN or infinity; every reward must be a finite number.")
+        if np.abs(rewards).max() > LARGEST_REWARD:
+            raise ValueError(
+                f"The reward function returned {rewards[np.abs(rewards).argmax()]:g}; returns are sums of many rewards, so that none "
+                f"may be larger than {LARGEST_REWARD:g}: scale them down."
+            )
         return rewards

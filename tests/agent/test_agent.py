@@ -236,6 +236,7 @@ def test_bad_arguments_are_refused_in_one_sentence(make: Callable[[], Any], kwar
         (lambda obs, action, next_obs: 1.0, "shape"),
         (lambda obs, action, next_obs: next_obs, "shape"),
         (lambda obs, action, next_obs: np.full(len(obs), np.nan), "NaN"),
+        (lambda obs, action, next_obs: np.full(len(obs), -1e300), "scale them down"),
         (lambda obs, action, next_obs: None, "shape|numbers|NaN"),
         ("fast", "function"),
     ],
