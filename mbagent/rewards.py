@@ -102,7 +102,7 @@ class GivenReward:
             raise ValueError("The reward function returned NaN or infinity; every reward must be a finite number.")
         if np.abs(rewards).max() > LARGEST_REWARD:
             raise ValueError(
-                f"The reward function returned {rewards[np.abs(rewards).argmax()]:g}; returns are sums of many rewards, so that none "
+                f"The reward function returned {rewards[np.abs(rewards).argmax()]:g}; returns are sums of many rewards: none "
                 f"may be larger than {LARGEST_REWARD:g}: scale them down."
             )
         return rewards
