@@ -101,8 +101,8 @@ def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.u
     joint, different, words = work.joint, work.different, work.words
     listed, values, coupled = work.units, work.values, work.coupled
     per_coupling, opened, base = work.per_coupling, work.opened, work.base
-    p = work.p
-    n_actions, first_meeting = len(always), len(columns) + len(always)
+    p, acts = work.p, g.acts
+    n_actions, first_meeting = len(always), len(columns) + acts.n_columns
     n_different = show_state(state, shown, columns, different, on)
     for m in range(len(meetings)):
         on[first_meeting + m] = meets(state, cells, meetings[m])
@@ -110,11 +110,27 @@ def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.u
         n = touched_units(
             action, state, different[:n_different], row, touched, by_meeting, always, first_meeting, on, usual, words, listed
         )
-        on[len(columns) + action] = True
+        for i in range(acts.first[action], acts.first[action + 1]):
+            on[len(columns) + acts.column[i]] = True
         rates_of(
-            listed[:n], state, action, on, units, members, entries, entry, node, leaf, habit, base_rates, still, values, rates
+            listed[:n],
+            state,
+            acts.way[action],
+            on,
+            units,
+            members,
+            entries,
+            entry,
+            node,
+            leaf,
+            habit,
+            base_rates,
+            still,
+            values,
+            rates,
         )
-        on[len(columns) + action] = False
+        for i in range(acts.first[action], acts.first[action + 1]):
+            on[len(columns) + acts.column[i]] = False
         for f in range(len(state)):
             base[f] = state[f]
         n_live, n_open, ended = _settle(
