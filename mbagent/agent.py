@@ -189,8 +189,12 @@ class ModelLearningAgent(SavableAlgorithm):
 
     def _build_models(self, space: FactoredSpace, actions: ActionEnumeration) -> tuple[TransitionModel, LearnedReward]:
         """A transition model and a learned reward, both new, of these factors."""
-        model, rate = self.model_name, check_learning_rate(self.lr_schedule(1.0))
-        n, parts = actions.n, actions.factored.cardinalities
+        model, n, parts, rate = (
+            self.model_name,
+            actions.n,
+            actions.factored.cardinalities,
+            check_learning_rate(self.lr_schedule(1.0)),
+        )
         model = build_model(model, space, n, rate, parts) if isinstance(model, str) else fitting_model(model, space, n)
         return model, LearnedReward(space.cardinalities, n, space.planes, seed=self._planning_seed)
 
