@@ -187,14 +187,9 @@ class ModelLearningAgent(SavableAlgorithm):
         self.policy.refresh()
         self.set_reward(self._custom_reward) if self._custom_reward is not None else self._refresh()
 
-    def _build_models(self, space: FactoredSpace, actions: ActionEnumeration) -> tuple[TransitionModel, LearnedReward]:
+    def _build_models(self, space: FactoredSpace, acts: ActionEnumeration) -> tuple[TransitionModel, LearnedReward]:
         """A transition model and a learned reward, both new, of these factors."""
-        model, n, parts, rate = (
-            self.model_name,
-            actions.n,
-            actions.factored.cardinalities,
-            check_learning_rate(self.lr_schedule(1.0)),
-        )
+        model, n, parts, rate = self.model_name, acts.n, acts.factored.cardinalities, check_learning_rate(self.lr_schedule(1.0))
         model = build_model(model, space, n, rate, parts) if isinstance(model, str) else fitting_model(model, space, n)
         return model, LearnedReward(space.cardinalities, n, space.planes, seed=self._planning_seed)
 
