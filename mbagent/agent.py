@@ -163,7 +163,7 @@ class ModelLearningAgent(SavableAlgorithm):
         self.experience = Experience(space, actions.n)
         if isinstance(self.model_name, str):  # a model that is given has the factors that it has
             space = self.experience.coding()
-        model, reward_model = self._build_models(space, actions.n)
+        model, reward_model = self._build_models(space, actions)
         policy = self.policy_class(
             self.observation_space,
             self.action_space,
@@ -187,11 +187,11 @@ class ModelLearningAgent(SavableAlgorithm):
         self.policy.refresh()
         self.set_reward(self._custom_reward) if self._custom_reward is not None else self._refresh()
 
-    def _build_models(self, space: FactoredSpace, n_actions: int) -> tuple[TransitionModel, LearnedReward]:
+    def _build_models(self, space: FactoredSpace, acts: ActionEnumeration) -> tuple[TransitionModel, LearnedReward]:
         """A transition model and a learned reward, both new, of these factors."""
-        model, rate = self.model_name, check_learning_rate(self.lr_schedule(1.0))
-        model = build_model(model, space, n_actions, rate) if isinstance(model, str) else fitting_model(model, space, n_actions)
-        return model, LearnedReward(space.cardinalities, n_actions, space.planes, seed=self._planning_seed)
+        model, n, parts, rate = self.model_name, acts.n, acts.factored.cardinalities, check_learning_rate(self.lr_schedule(1.0))
+        model = build_model(model, space, n, rate, parts) if isinstance(model, str) else fitting_model(model, space, n)
+        return model, LearnedReward(space.cardinalities, n, space.planes, seed=self._planning_seed)
 
     def _recode(self, space: FactoredSpace) -> None:
         """Factors whose values are those of ``space``; where that changes anything, nothing is learned in them yet."""
@@ -199,7 +199,7 @@ class ModelLearningAgent(SavableAlgorithm):
         if space.same_factors(policy.factored):
             return
         starts = space.narrow(np.asarray(policy.factored.widen(policy.start_states), dtype=np.int64))
-        policy.recode(space, *self._build_models(space, policy.actions.n), starts, False)
+        policy.recode(space, *self._build_models(space, policy.actions), starts, False)
         self.goals.recode()
 
     # ------------------------------------------------------------------ goals

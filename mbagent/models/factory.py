@@ -95,12 +95,14 @@ def build_tabular(space: FactoredSpace, n_actions: int, learning_rate: float) ->
     return TabularModel(space.cardinalities, n_actions)
 
 
-def build_graphs(space: FactoredSpace, n_actions: int, learning_rate: float) -> TransitionModel:
+def build_graphs(
+    space: FactoredSpace, n_actions: int, learning_rate: float, parts: Sequence[int] | None = None
+) -> TransitionModel:
     """Decision graphs over the few things that each variable hangs on; on planes, the same at every position."""
     del learning_rate
     if space.planes is not None and channel_cardinalities(space) is not None:
-        return LocalGraphModel(space, n_actions)
-    return DecisionGraphModel(space.cardinalities, n_actions)
+        return LocalGraphModel(space, n_actions, parts=parts)
+    return DecisionGraphModel(space.cardinalities, n_actions, parts=parts)
 
 
 _FACTORIES: dict[str, ModelFactory] = {
@@ -124,12 +126,26 @@ def register_model(name: str, factory: ModelFactory) -> None:
     _FACTORIES[name] = factory
 
 
-def build_model(name: str, space: FactoredSpace, n_actions: int, learning_rate: float) -> TransitionModel:
+def build_model(
+    name: str, space: FactoredSpace, n_actions: int, learning_rate: float, parts: Sequence[int] | None = None
+) -> TransitionModel:
     """The model registered as ``name``.
+
+    Args:
+        name: the model's.
+        space: of observations.
+        n_actions: number of enumerated actions A.
+        learning_rate: of models that have one.
+        parts: number of values of each part of an action, for models that see actions so (decision graphs); None for none.
 
     Raises:
         ValueError: there is none.
     """
     if name not in _FACTORIES:
         raise ValueError(f"There is no model called {name!r}; choose one of {sorted(_FACTORIES)} or pass a TransitionModel.")
-    return _FACTORIES[name](space, n_actions, learning_rate)
+    factory = _FACTORIES[name]
+    return (
+        build_graphs(space, n_actions, learning_rate, parts)
+        if factory is build_graphs
+        else factory(space, n_actions, learning_rate)
+    )

@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mbagent.models.graphs.acts import Acts, shown_acts
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.transitions import TransitionBatch, TransitionDataset
 
@@ -66,7 +67,7 @@ def steps_in_a_row(rows: TransitionBatch, most: int) -> tuple[TransitionBatch, T
 
 
 def with_past(
-    now: TransitionBatch, before: TransitionBatch, cardinalities: tuple[int, ...], n_actions: int, board: PlaneLayout | None
+    now: TransitionBatch, before: TransitionBatch, cardinalities: tuple[int, ...], acts: Acts, board: PlaneLayout | None
 ) -> tuple[FactoredSpace, TransitionBatch]:
     """Transitions that follow others, with the others' states and actions as part of their state.
 
@@ -74,7 +75,7 @@ def with_past(
         now: the transitions.
         before: those that they follow.
         cardinalities: number of values of each factor.
-        n_actions: number of actions A.
+        acts: the actions.
         board: where the factors are cells of planes; the past is further planes then.
 
     Returns:
@@ -86,12 +87,12 @@ def with_past(
         return states if board is None else board.to_planes(states)
 
     def shown(states: NDArray[np.int64], past: NDArray[np.int64], actions: NDArray[np.int64]) -> NDArray[np.int64]:
-        bits = (actions[:, None] == np.arange(n_actions)).astype(np.int64)
+        bits = shown_acts(acts, actions).astype(np.int64)
         bits = bits if board is None else np.broadcast_to(bits[:, :, None, None], (*bits.shape, *shape[1:]))
         return np.concatenate([laid_out(states), laid_out(past), bits], axis=1)
 
     cards = laid_out(np.asarray(cardinalities)[None])[0]
-    twos = np.full((n_actions, *shape[1:]), 2)
+    twos = np.full((acts.n_columns, *shape[1:]), 2)
     sizes = np.concatenate([cards, cards, twos])
     space = FactoredSpace(spaces.MultiBinary(sizes.shape) if (sizes == 2).all() else spaces.MultiDiscrete(sizes))
     states = space.encode(shown(now.states, before.states, before.actions))

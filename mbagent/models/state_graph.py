@@ -23,6 +23,9 @@ Indices: TypeAlias = NDArray[np.int64]
 FEWEST_SLOTS = 1024
 """Places of the smallest hash table."""
 
+AT_ONCE = 16_384
+"""Successors that room is made for at once, unless one state may have more; a node takes 16 bytes for each action."""
+
 
 class GraphArrays(NamedTuple):
     """What compiled kernels need of a graph, with room to grow; N nodes and M edges of them are in use.
@@ -256,7 +259,7 @@ class StateGraph:
             old = len(getattr(arrays, fields[0]))
             if used + extra > old:
                 size = max(used + extra, 2 * old, 1024)
-                arrays = arrays._replace(**{name: _longer(getattr(arrays, name), size) for name in fields})
+                arrays = arrays._replace(**{name: _longer(getattr(arrays, name), used, size) for name in fields})
         if 2 * len(arrays.tags) > len(arrays.slots):
             slots = np.full(1 << (2 * len(arrays.tags) - 1).bit_length(), -1, dtype=np.int64)
             _place_all(arrays.tags[: len(self)], slots)
@@ -285,8 +288,9 @@ class StateGraph:
         size = len(self)
         if self.kernel is not None:
             key, offset = grid_of(seed)
+            of_one = 2 * n_samples * self.model.n_actions
             while len(nodes):
-                most = 2 * n_samples * self.model.n_actions * min(len(nodes), 64)
+                most = of_one * max(1, min(len(nodes), AT_ONCE // of_one))
                 self.reserve(most, most)
                 nodes = nodes[_expand_all(self.kernel, self.arrays, nodes, n_samples, key, offset) :]
         elif len(nodes):
@@ -306,8 +310,8 @@ class StateGraph:
         return result
 
 
-def _longer(array: NDArray[Any], size: int) -> NDArray[Any]:
-    """The array with room for ``size`` rows."""
+def _longer(array: NDArray[Any], used: int, size: int) -> NDArray[Any]:
+    """The first ``used`` rows, with room for ``size``: what was never written takes no memory yet."""
     longer = np.empty((size, *array.shape[1:]), dtype=array.dtype)
-    longer[: len(array)] = array
+    longer[:used] = array[:used]
     return longer

@@ -57,7 +57,7 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]], layout: Layout, n_columns: i
 def _sound(graphs: Graphs, layout: Layout, n_columns: int) -> bool:
     """Whether every index leads somewhere and no path is endless."""
     n_units, n_nodes, n_entries = len(layout.outputs), len(graphs.column), len(graphs.values)
-    pairs = np.concatenate([[0], np.cumsum(layout.n_actions * layout.outputs)])
+    pairs = np.concatenate([[0], np.cumsum(layout.acts.n_ways * layout.outputs)])
     start = np.concatenate([[0], np.cumsum(layout.outputs)])
     if not (np.array_equal(graphs.pairs, pairs) and np.array_equal(graphs.start, start)):
         return False

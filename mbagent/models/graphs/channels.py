@@ -59,7 +59,7 @@ def _ends(planes: PlaneTable, numbers: Ints) -> tuple[list[Question], list[Searc
     first, pattern = distinct(np.packbits(far, axis=1))
     nothing, ends = np.zeros(len(rows), dtype=np.int64), rows.terminated.astype(np.int64)
     counting = np.arange(min(planes.since[-1], len(rows)), len(rows))
-    asked = ask(len(planes.cardinalities), 2, Seen(pattern, rows.actions, nothing, ends).select(counting))
+    asked = ask(len(planes.cardinalities), 2, Seen(pattern, planes.acts.way[rows.actions], nothing, ends).select(counting))
     return asked, planes.split(asked, far[first], numbers)
 
 

@@ -31,7 +31,8 @@ class Graphs(NamedTuple):
 
     Attributes:
         changing: units that have graphs, int64.
-        pairs: where the pairs (action, value) of each unit begin, int64 [U + 1]; pair ``action * cardinality + value``.
+        pairs: where the pairs (way, value) of each unit begin, int64 [U + 1]; pair ``way * cardinality + value``, with the
+            action's way, see ``acts.Acts``.
         entries: where the entries of each pair begin, int64 [pairs + 1].
         values: the value that an entry is about, int64 [E].
         nodes: its first node, int64 [E].
@@ -89,10 +90,11 @@ class _Nodes:
 
 
 def linked(
-    entries: Sequence[tuple[int, int, int]], n_pairs: int, links: Sequence[tuple[int, int, int]]
+    entries: Ints | Sequence[tuple[int, int, int]], n_pairs: int, links: Sequence[tuple[int, int, int]]
 ) -> tuple[Ints, Ints, Ints, Ints, Ints, Ints]:
     """The arrays from ``entries`` to ``on`` of Graphs, from entries (pair, value, node) and nodes (column, off, on)."""
-    table = np.asarray(sorted(entries), dtype=np.int64).reshape(-1, 3)
+    table = np.asarray(entries, dtype=np.int64).reshape(-1, 3)
+    table = table[np.lexsort(table.T[::-1])]
     parts = np.asarray(links, dtype=np.int64).reshape(-1, 3)
     begins = np.searchsorted(table[:, 0], np.arange(n_pairs + 1)).astype(np.int64)
     value, node = np.ascontiguousarray(table[:, 1:].T)
@@ -111,19 +113,16 @@ def build(layout: Layout, asked: Sequence[Question], found: Sequence[Search], ha
         still: probability that a unit without graphs changes.
     """
     nodes, prior = _Nodes(), best_prior(found)
-    pairs = np.concatenate([[0], np.cumsum(layout.n_actions * layout.outputs)]).astype(np.int64)
-    entries: list[tuple[int, int, int]] = []
+    pairs = np.concatenate([[0], np.cumsum(layout.acts.n_ways * layout.outputs)]).astype(np.int64)
+    entries = [np.zeros((0, 3), dtype=np.int64)]
     for question, search in zip(asked, found, strict=True):
         first = nodes.graph(search, prior)
-        entries += [
-            (int(pairs[question.unit] + pair), int(value), int(node))
-            for pair, value, node in zip(question.pairs, question.values, first, strict=True)
-        ]
+        entries.append(np.stack([pairs[question.unit] + question.pairs, question.values, first], axis=1))
     rates = np.asarray(nodes.rates, dtype=np.float64).reshape(-1, 2)
     return Graphs(
         np.asarray(sorted({question.unit for question in asked}), dtype=np.int64),
         pairs,
-        *linked(entries, int(pairs[-1]), nodes.links),
+        *linked(np.concatenate(entries), int(pairs[-1]), nodes.links),
         np.ascontiguousarray(rates[:, 0]),
         np.ascontiguousarray(rates[:, 1]),
         np.concatenate([habit.stays for habit in habits]),
@@ -136,7 +135,7 @@ def build(layout: Layout, asked: Sequence[Question], found: Sequence[Search], ha
 
 @dataclass(frozen=True)
 class Habit:
-    """What a unit does after each pair (action, value), whatever else is the case.
+    """What a unit does after each pair (way, value), whatever else is the case.
 
     Attributes:
         stays: share of a pair's rows in which the unit kept its value, [pairs]; 1 where there are none.
@@ -158,18 +157,17 @@ def habit_of(cardinality: int, n_actions: int, actions: Ints, now: Ints, then: I
     where the same things follow again and again.
     """
     size = n_actions * cardinality
-    counts = np.zeros((size, cardinality))
     pair = actions * cardinality + now
-    np.add.at(counts, (pair, then), 1.0)
-    visits = counts.sum(axis=1)
-    stayed = counts[np.arange(size), np.arange(size) % cardinality]
+    visits = np.bincount(pair, minlength=size).astype(np.float64)
+    stayed = np.bincount(pair[now == then], minlength=size)
     stays = np.where(visits > 0, stayed / np.maximum(visits, 1), 1.0)
     anew = np.bincount(then[now != then], minlength=cardinality) + 0.5
     base = anew / anew.sum()
     if cardinality == 2 or len(pair) == 0:
         return Habit(stays, np.zeros(size), base)
-    seen, value = np.nonzero(counts)
-    n, c = visits[seen], counts[seen, value]
+    met, times = np.unique(pair * cardinality + then, return_counts=True)
+    seen, value = np.divmod(met, cardinality)
+    n, c = visits[seen], times.astype(np.float64)
 
     def foretold(theta: float) -> float:
         again = np.where(c > 1, np.log(np.maximum(c - 1, 1)), np.log(theta * base[value]))
@@ -209,9 +207,11 @@ def show(state: Ints, action: int, layout: Layout, on: Bools) -> None:
     for column in range(n):
         value = state[layout.factor[column]]
         on[column] = layout.value[column] <= value <= layout.top[column]
-    for other in range(layout.n_actions):
-        on[n + other] = other == action
-    n += layout.n_actions
+    acts = layout.acts
+    on[n : n + acts.n_columns] = False
+    for i in range(acts.first[action], acts.first[action + 1]):
+        on[n + acts.column[i]] = True
+    n += acts.n_columns
     for m in range(len(layout.meetings)):
         on[n + m] = meets(state, layout.cells, layout.meetings[m])
 
@@ -237,7 +237,7 @@ def meets(state: Ints, cells: Ints, meeting: Ints) -> bool:
 @compiled
 def n_columns(layout: Layout) -> int:
     """Number of columns D."""
-    return len(layout.factor) + layout.n_actions + len(layout.meetings)
+    return len(layout.factor) + layout.acts.n_columns + len(layout.meetings)
 
 
 @compiled
@@ -276,7 +276,7 @@ def distributions(
                     value = member - first
                     break
         values[unit] = value
-        pair = graphs.pairs[unit] + action * n + value
+        pair = graphs.pairs[unit] + layout.acts.way[action] * n + value
         total, slack = 0.0, 0.0
         for k in range(start, start + n):
             out[k] = 0.0

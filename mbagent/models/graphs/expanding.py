@@ -11,6 +11,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from mbagent.models.compiled_model import Outcomes, implements, outcomes, work_for
+from mbagent.models.graphs.acts import Acts
 from mbagent.models.graphs.compiled import Bools, Floats, Ints, meets
 from mbagent.models.graphs.draws import settled
 from mbagent.models.graphs.lean import (
@@ -101,8 +102,8 @@ def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.u
     joint, different, words = work.joint, work.different, work.words
     listed, values, coupled = work.units, work.values, work.coupled
     per_coupling, opened, base = work.per_coupling, work.opened, work.base
-    p = work.p
-    n_actions, first_meeting = len(always), len(columns) + len(always)
+    p, acts = work.p, g.acts
+    n_actions, first_meeting = len(always), len(columns) + acts.n_columns
     n_different = show_state(state, shown, columns, different, on)
     for m in range(len(meetings)):
         on[first_meeting + m] = meets(state, cells, meetings[m])
@@ -110,11 +111,10 @@ def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.u
         n = touched_units(
             action, state, different[:n_different], row, touched, by_meeting, always, first_meeting, on, usual, words, listed
         )
-        on[len(columns) + action] = True
-        rates_of(
-            listed[:n], state, action, on, units, members, entries, entry, node, leaf, habit, base_rates, still, values, rates
-        )
-        on[len(columns) + action] = False
+        _show_action(acts, action, len(columns), True, on)
+        way = acts.way[action]
+        rates_of(listed[:n], state, way, on, units, members, entries, entry, node, leaf, habit, base_rates, still, values, rates)
+        _show_action(acts, action, len(columns), False, on)
         for f in range(len(state)):
             base[f] = state[f]
         n_live, n_open, ended = _settle(
@@ -127,6 +127,13 @@ def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.u
         for column in range(shown[different[i]], shown[different[i] + 1]):
             on[column] = usual[column]
     return total
+
+
+@inlined
+def _show_action(acts: Acts, action: int, first: int, shown: bool, on: Bools) -> None:
+    """Switches an action's columns, which begin at ``first``, on or off."""
+    for i in range(acts.first[action], acts.first[action + 1]):
+        on[first + acts.column[i]] = shown
 
 
 @inlined

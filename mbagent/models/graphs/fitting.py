@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.graphs import draws
+from mbagent.models.graphs.acts import Acts
 from mbagent.models.graphs.compiled import Graphs, build, habit_of
 from mbagent.models.graphs.conditioner import find_dependent, uncertain_rows
 from mbagent.models.graphs.exclusive import find_cliques, find_groups
@@ -103,7 +104,7 @@ class _Table:
     def seen(self, unit: int) -> Seen:
         """A unit's values in all rows."""
         now, then = (values[:, unit].astype(np.int64) for values in (self.now, self.then))
-        return Seen(self.pattern, self.rows.actions, now, then)
+        return Seen(self.pattern, self.layout.acts.way[self.rows.actions], now, then)
 
     def kinds(self, seen: Ints) -> Ints:
         """Kind of each column, by some rows."""
@@ -115,7 +116,7 @@ class _Table:
         habits = []
         for unit, cardinality in enumerate(self.layout.outputs):
             some = self.seen(unit).select(self.counting(unit, seen))
-            habits.append(habit_of(int(cardinality), self.layout.n_actions, some.actions, some.now, some.then))
+            habits.append(habit_of(int(cardinality), self.layout.acts.n_ways, some.actions, some.now, some.then))
         return build(self.layout, asked, found, habits, still)
 
 
@@ -126,7 +127,7 @@ def nothing_late(graphs: Graphs) -> Graphs:
 
 def fit_graphs(
     cardinalities: Sequence[int],
-    n_actions: int,
+    acts: Acts,
     rows: TransitionBatch,
     events: Bools,
     in_pairs: bool = True,
@@ -138,7 +139,7 @@ def fit_graphs(
 
     Args:
         cardinalities: number of values of each factor.
-        n_actions: number of actions A.
+        acts: the actions.
         rows: N transitions.
         events: which of them are rare events, bool [N].
         in_pairs: whether to look for causes that matter only together, which takes most of the time.
@@ -147,7 +148,7 @@ def fit_graphs(
         since: first row that counts for each factor and for ``terminated``, int64 [F + 1]; None for all.
     """
     groups = find_groups(cardinalities, rows.before, rows.after, ~events)
-    layout = lay_out(cardinalities, groups, n_actions)
+    layout = lay_out(cardinalities, groups, acts)
     table, usual = _Table(layout, rows, events, moving, since), np.flatnonzero(~events)
     last = len(layout.outputs) - 1
     asked_of = {unit: np.arange(len(rows)) if unit == last else usual for unit in range(last + 1)}
@@ -179,7 +180,7 @@ def _late_graphs(
         asked = table.questions(unit, replace(some, pattern=pattern))
         more_kinds = np.concatenate([kinds, kinds.max(initial=0) + 1 + kinds[columns]])
         more = np.concatenate([table.columns[some.pattern[first]], following[first]], axis=1)
-        found = find_splits([q.head for q in asked], more, more_kinds, layout.n_actions, in_pairs)
+        found = find_splits([q.head for q in asked], more, more_kinds, layout.acts.n_ways, in_pairs)
         if any(split.column >= n_columns for search in found for split in search.splits):
             numbers = np.concatenate([np.arange(n_columns), n_columns + columns])
             late.append(unit)
@@ -225,6 +226,6 @@ def _graphs(
     anything may change, each for itself.
     """
     asked = [question for unit, which in asked_of.items() for question in table.ask(unit, which)]
-    found = find_splits([q.head for q in asked], table.columns, table.kinds(seen), table.layout.n_actions, in_pairs)
+    found = find_splits([q.head for q in asked], table.columns, table.kinds(seen), table.layout.acts.n_ways, in_pairs)
     still = 0.5 / (len(seen) * (len(table.layout.outputs) if regular else 1) + 1.0)
     return table.build(asked, found, seen, still), asked, found

@@ -9,6 +9,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent.models.graphs.acts import Acts
 from mbagent.models.graphs.compiled import Graphs, linked, n_columns
 from mbagent.models.graphs.units import Layout, coupled_layout, lay_out
 from mbagent.models.graphs.windows import ACTION, BORDER, MEETING, NEXT, NEXT_MEETING, WRAP
@@ -56,7 +57,7 @@ class LocalGraphs:
         late: those of channels whose cells are drawn late, from the upper left on, channel after channel.
         columns: the relative columns, int64 [D, 7], see ``windows.py``.
         cardinalities: number of values of each channel's cells, length C.
-        n_actions: number of actions A.
+        acts: the actions.
         couplings: bits of which at most one is on.
     """
 
@@ -64,7 +65,7 @@ class LocalGraphs:
     late: Graphs
     columns: Ints
     cardinalities: tuple[int, ...]
-    n_actions: int
+    acts: Acts
     couplings: tuple[Coupling, ...]
 
 
@@ -78,10 +79,10 @@ def instantiate(local: LocalGraphs, board: PlaneLayout) -> tuple[Layout, Graphs,
     asked = np.concatenate([local.graphs.column, local.late.column])
     used = np.unique(asked[asked >= 0])
     meetings, later = (used[local.columns[used, 0] == kind] for kind in (MEETING, NEXT_MEETING))
-    layout = lay_out([int(c) for c in cardinalities], (), local.n_actions, ordinal=False)
+    layout = lay_out([int(c) for c in cardinalities], (), local.acts, ordinal=False)
     now, then = (np.ascontiguousarray(local.columns[numbers, 1:]) for numbers in (meetings, later))
     layout = with_couplings(layout._replace(cells=cells, meetings=now, next_meetings=then), local.couplings)
-    numbers = {int(d): len(layout.factor) + layout.n_actions + i for i, d in enumerate(meetings)}
+    numbers = {int(d): len(layout.factor) + layout.acts.n_columns + i for i, d in enumerate(meetings)}
     numbers |= {int(d): n_columns(layout) + len(layout.factor) + i for i, d in enumerate(later)}
     graphs, late = (_Board(local, layout, numbers).graphs(which) for which in (local.graphs, local.late))
     units = [layout.cells[c].ravel() if c < len(cells) else np.asarray([n_factors]) for c in local.late.changing]
@@ -121,7 +122,7 @@ class _Board:
         """All of them, from those of relative columns."""
         local, layout, self.relative = self.local, self.layout, graphs
         _, height, width = layout.cells.shape
-        pairs = np.concatenate([[0], np.cumsum(layout.n_actions * layout.outputs)]).astype(np.int64)
+        pairs = np.concatenate([[0], np.cumsum(layout.acts.n_ways * layout.outputs)]).astype(np.int64)
         shared = {int(node): self._add(-1, 0, 0, int(node)) for node in np.flatnonzero(graphs.column < 0)}
         channel_of = np.full(len(layout.outputs), len(local.cardinalities))
         entries: list[tuple[int, int, int]] = []

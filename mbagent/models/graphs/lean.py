@@ -13,6 +13,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent.models.graphs.acts import Acts
 from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, distributions, n_columns, show
 from mbagent.models.graphs.draws import settled
 from mbagent.models.graphs.units import Layout
@@ -52,7 +53,8 @@ class Lean(NamedTuple):
         touched: units that a factor's value touches, as bits, uint64 [A or 1, R, W].
         by_meeting: the same of meetings, uint64 [A or 1, M, W].
         always: units that do something even where everything is 0, uint64 [A, W].
-        usual_on: columns that are on where everything is 0, bool [D].
+        usual_on: columns that are on where everything is 0 and no action is taken, bool [D].
+        acts: see ``units.Layout``.
     """
 
     units: Ints
@@ -74,6 +76,7 @@ class Lean(NamedTuple):
     by_meeting: Words
     always: Words
     usual_on: Bools
+    acts: Acts
 
 
 def lean(layout: Layout, graphs: Graphs, cardinalities: tuple[int, ...]) -> Lean:
@@ -85,17 +88,18 @@ def lean(layout: Layout, graphs: Graphs, cardinalities: tuple[int, ...]) -> Lean
         cardinalities: number of values of each factor, length F.
     """
     n_words, n_rows = -(-len(layout.outputs) // 64), int(sum(cardinalities))
-    n_tables = layout.n_actions if layout.n_actions * n_rows * n_words <= MOST_WORDS else 1
+    n_actions = len(layout.acts.way)
+    n_tables = n_actions if n_actions * n_rows * n_words <= MOST_WORDS else 1
     row = np.concatenate([[0], np.cumsum(cardinalities)]).astype(np.int64)
     touched = np.zeros((n_tables, n_rows, n_words), dtype=np.uint64)
     by_meeting = np.zeros((n_tables, len(layout.meetings), n_words), dtype=np.uint64)
     nothing, on = np.zeros(layout.n_factors, dtype=np.int64), np.zeros(n_columns(layout), dtype=np.bool_)
     shown = np.searchsorted(layout.factor, np.arange(layout.n_factors + 1)).astype(np.int64)
-    always = np.zeros((layout.n_actions, n_words), dtype=np.uint64)
+    always = np.zeros((n_actions, n_words), dtype=np.uint64)
     _usual(layout, graphs, nothing, on, always)
     _dependents(layout, graphs, row, nothing, on, touched, by_meeting)
     show(nothing, 0, layout, on)
-    on[len(layout.factor) : len(layout.factor) + layout.n_actions] = False
+    on[len(layout.factor) : len(layout.factor) + layout.acts.n_columns] = False
     sizes = np.diff(layout.first)
     units = np.stack([layout.first[:-1], sizes, layout.outputs, graphs.start[:-1], graphs.pairs[:-1], layout.coupling_of], axis=1)
     return Lean(
@@ -118,6 +122,7 @@ def lean(layout: Layout, graphs: Graphs, cardinalities: tuple[int, ...]) -> Lean
         by_meeting=by_meeting,
         always=always,
         usual_on=on,
+        acts=layout.acts,
     )
 
 
@@ -132,7 +137,7 @@ def _usual(layout: Layout, graphs: Graphs, nothing: Ints, on: Bools, always: Wor
     """Fills ``always``; see Lean."""
     values, rates = np.zeros(len(layout.outputs), dtype=np.int64), np.zeros(graphs.start[-1], dtype=np.float64)
     everything = np.arange(len(layout.outputs))
-    for action in range(layout.n_actions):
+    for action in range(len(layout.acts.way)):
         show(nothing, action, layout, on)
         distributions(everything, nothing, action, layout, graphs, on, values, rates)
         for unit in graphs.changing:
@@ -152,18 +157,18 @@ def _dependents(layout: Layout, graphs: Graphs, row: Ints, nothing: Ints, on: Bo
     Where everything is 0, a unit's graphs are followed to their usual leaves; as long as the columns asked on these ways are as
     usual, nothing else can be found. So only these touch the unit.
     """
-    first_action, first_meeting = len(layout.factor), len(layout.factor) + layout.n_actions
+    first_action, first_meeting = len(layout.factor), len(layout.factor) + layout.acts.n_columns
     for unit in range(len(layout.outputs) - 2):
         if layout.coupling_of[unit] >= 0 or (graphs.changing == unit).any():
             for factor in layout.members[layout.first[unit] : layout.first[unit + 1]]:
                 for r in range(row[factor] + 1, row[factor + 1]):
                     for table in range(len(touched)):
                         set_bit(touched[table, r], unit)
-    for action in range(layout.n_actions):
+    for action in range(len(layout.acts.way)):
         table = action if len(touched) > 1 else 0
         show(nothing, action, layout, on)
         for unit in graphs.changing:
-            pair = graphs.pairs[unit] + action * layout.outputs[unit]
+            pair = graphs.pairs[unit] + layout.acts.way[action] * layout.outputs[unit]
             for entry in range(graphs.entries[pair], graphs.entries[pair + 1]):
                 node = graphs.nodes[entry]
                 while graphs.column[node] >= 0:
@@ -255,7 +260,7 @@ def value_of(unit: int, state: Ints, units: Ints, members: Ints) -> int:
 def rates_of(
     touched: Ints,
     state: Ints,
-    action: int,
+    way: int,
     on: Bools,
     units: Ints,
     members: Ints,
@@ -274,7 +279,7 @@ def rates_of(
         unit = touched[i]
         n, start, value = units[unit, OUTPUTS], units[unit, START], value_of(unit, state, units, members)
         values[i] = value
-        pair = units[unit, PAIR] + action * n + value
+        pair = units[unit, PAIR] + way * n + value
         begins, ends = entries[pair], entries[pair + 1]
         total, slack = 0.0, 0.0
         for k in range(start, start + n):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -42,14 +42,22 @@ class LocalGraphModel(DecisionGraphModel):
         n_actions: number of enumerated actions A.
         reach: how far a neighbourhood reaches; None to find out from held-out episodes.
         validation: share of episodes held out for the report; the graphs are fitted to all rows in the end.
+        parts: see DecisionGraphModel.
 
     Raises:
         ValueError: the space is no stack of planes of that kind.
     """
 
-    def __init__(self, space: FactoredSpace, n_actions: int, reach: Reach | None = None, validation: float = 0.1) -> None:
+    def __init__(
+        self,
+        space: FactoredSpace,
+        n_actions: int,
+        reach: Reach | None = None,
+        validation: float = 0.1,
+        parts: Sequence[int] | None = None,
+    ) -> None:
         """See the class."""
-        super().__init__(space.cardinalities, n_actions, validation)
+        super().__init__(space.cardinalities, n_actions, validation, parts)
         cards = None if space.planes is None else channel_cardinalities(space)
         if space.planes is None or cards is None:
             raise ValueError(
@@ -62,11 +70,11 @@ class LocalGraphModel(DecisionGraphModel):
 
     def _forget(self, cards: tuple[int, ...], reach: Reach) -> None:
         """Knows nothing, but how far neighbourhoods reach."""
-        self.reach, n_actions = reach, self.n_actions
-        columns = relative_columns(cards, n_actions, reach)
-        nothing = [habit_of(k, n_actions, *([np.zeros(0, dtype=np.int64)] * 3)) for k in (*cards, 2, 2)]
-        graphs = build(channel_layout(cards, n_actions), (), (), nothing, 1e-9)
-        self.local = LocalGraphs(graphs, nothing_late(graphs), columns, cards, n_actions, ())
+        self.reach = reach
+        columns = relative_columns(cards, self.parts, reach)
+        nothing = [habit_of(k, self.acts.n_ways, *([np.zeros(0, dtype=np.int64)] * 3)) for k in (*cards, 2, 2)]
+        graphs = build(channel_layout(cards, self.acts), (), (), nothing, 1e-9)
+        self.local = LocalGraphs(graphs, nothing_late(graphs), columns, cards, self.acts, ())
         self._instantiate((), ())
 
     def _instantiate(self, asked: tuple[Question, ...], found: tuple[Search, ...]) -> None:
@@ -104,7 +112,7 @@ class LocalGraphModel(DecisionGraphModel):
             factors = tuple(int(f) for f in self.fitted.layout.cells[channel].ravel())
             columns = asked_columns(self.local.graphs, channel) | asked_columns(self.local.late, channel)
             names = dict.fromkeys(named_column(self.local.columns[d]) for d in sorted(columns))
-            layout = channel_layout(self.local.cardinalities, self.n_actions)
+            layout = channel_layout(self.local.cardinalities, self.acts)
             if hangs_on_action(self.local.graphs, channel, layout):
                 names = {"action": None, **{name: None for name in names if not name.startswith("action ")}}
             found.append(Variable(f"channel {channel}", factors, tuple(names)))
@@ -114,7 +122,7 @@ class LocalGraphModel(DecisionGraphModel):
         return self.board
 
     def _with_memory(self, space: FactoredSpace) -> DecisionGraphModel:
-        return LocalGraphModel(space, self.n_actions, self.reach)
+        return LocalGraphModel(space, self.n_actions, self.reach, parts=self.parts)
 
     def _since(self, rows: TransitionBatch, events: Bools) -> Ints:
         """First row that tells of each channel, and of ``terminated``, as it is now."""
@@ -160,7 +168,7 @@ class LocalGraphModel(DecisionGraphModel):
     def _learn(self, rows: TransitionBatch, jointly: bool = True, since: Ints | None = None, in_pairs: bool = True) -> None:
         """Graphs first, each cell for itself; then what is never on together, and what hangs on what others become."""
         local = self.local
-        planes = PlaneTable(rows, self.board, local.cardinalities, local.columns, self.n_actions, since, in_pairs)
+        planes = PlaneTable(rows, self.board, local.cardinalities, local.columns, self.acts, since, in_pairs)
         self.searched, self.counted = len(planes.rows), len(planes.every_action)
         graphs, asked, found = learn_channels(planes)
         self.local = replace(local, graphs=graphs, late=nothing_late(graphs), couplings=())
@@ -194,7 +202,7 @@ class LocalGraphModel(DecisionGraphModel):
         space = space if isinstance(space, FactoredSpace) else FactoredSpace(space)
         if space.planes is None:
             raise ValueError(f"for_space carries knowledge of planes over to planes of another size, but got {space.space}.")
-        other = LocalGraphModel(space, self.n_actions, self.given, self.validation)
+        other = LocalGraphModel(space, self.n_actions, self.given, self.validation, self.parts)
         if other.local.cardinalities != self.local.cardinalities:
             raise ValueError(
                 f"This model knows channels with {self.local.cardinalities} values, but {space.space} has "
@@ -226,11 +234,11 @@ class LocalGraphModel(DecisionGraphModel):
         if len(parts) != 2 or parts[0] not in range(1, LARGEST_RADIUS + 1) or parts[1] not in (0, 1):
             raise ValueError("These weights are of neighbourhoods that reach as far as none can; the file is damaged.")
         reach = Reach(int(parts[0]), bool(parts[1]))
-        columns = relative_columns(cards, self.n_actions, reach)
+        columns = relative_columns(cards, self.parts, reach)
         graphs, late = (
             from_arrays(
                 {part: state[f"{name}.{part}"] for part in Graphs._fields},
-                channel_layout(cards, self.n_actions),
+                channel_layout(cards, self.acts),
                 len(columns),
             )
             for name in ("local", "late")
@@ -244,7 +252,7 @@ class LocalGraphModel(DecisionGraphModel):
             for c in couplings
         ):
             raise ValueError("These weights couple cells that these planes do not have; load them into a model of the same kind.")
-        self.local, self.reach = LocalGraphs(graphs, late, columns, cards, self.n_actions, couplings), reach
+        self.local, self.reach = LocalGraphs(graphs, late, columns, cards, self.acts, couplings), reach
         self._instantiate((), ())
 
 

@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent.models.graphs.acts import Acts
 from mbagent.models.graphs.compiled import Graphs, build, habit_of
 from mbagent.models.graphs.greedy import find_splits
 from mbagent.models.graphs.search import Search
@@ -48,9 +49,9 @@ CHUNK = 50_000_000
 """Entries of the table that are made at once."""
 
 
-def channel_layout(cardinalities: Sequence[int], n_actions: int) -> Layout:
+def channel_layout(cardinalities: Sequence[int], acts: Acts) -> Layout:
     """Channels as the factors of a layout; its own columns mean nothing."""
-    return lay_out(cardinalities, (), n_actions, ordinal=False)
+    return lay_out(cardinalities, (), acts, ordinal=False)
 
 
 def _counted(rows: TransitionBatch) -> tuple[TransitionBatch, Ints]:
@@ -76,7 +77,7 @@ class PlaneTable:
         board: where cells lie.
         cardinalities: number of values of each channel's cells, length C.
         columns: all relative columns, int64 [D, 7].
-        n_actions: number of actions A.
+        acts: the actions.
         since: first row that counts for each channel and for ``terminated``, int64 [C + 1]; None for all.
         in_pairs: whether to look for causes that matter only together, which takes most of the time.
     """
@@ -87,13 +88,13 @@ class PlaneTable:
         board: PlaneLayout,
         cardinalities: tuple[int, ...],
         columns: Ints,
-        n_actions: int,
+        acts: Acts,
         since: Ints | None = None,
         in_pairs: bool = True,
     ) -> None:
         """See the class."""
         self.in_pairs = in_pairs
-        self.board, self.cardinalities, self.columns, self.n_actions = board, cardinalities, columns, n_actions
+        self.board, self.cardinalities, self.columns, self.acts = board, cardinalities, columns, acts
         self.n_cells = board.height * board.width
         self.since = np.zeros(len(cardinalities) + 1, dtype=np.int64) if since is None else since
         rows, counted = _counted(rows)
@@ -112,7 +113,7 @@ class PlaneTable:
         self.rows = rows if self.whole else rows.select(taken)
         self.before, self.after = board.to_planes(self.rows.before), board.to_planes(self.rows.after)
         self.since = np.searchsorted(taken, self.since)
-        self.actions = np.repeat(self.rows.actions, self.n_cells)
+        self.actions = np.repeat(acts.way[self.rows.actions], self.n_cells)
 
     def _looks(self, planes: Factors, actions: Ints) -> tuple[Bools, Ints, Ints]:
         """Columns of all cells that look different, which each cell looks like, and which transitions that is of.
@@ -157,7 +158,7 @@ class PlaneTable:
         told = column_values(self.columns[columns], self.before, self.rows.actions)[self.cells_since(channel)]
         value = np.concatenate([told, np.ones((len(told), 1), dtype=np.bool_)], axis=1).argmax(axis=1)
         look = (seen.actions * cardinality + seen.now) * (len(columns) + 1) + value
-        first = np.full(self.n_actions * cardinality * (len(columns) + 1), -1)
+        first = np.full(self.acts.n_ways * cardinality * (len(columns) + 1), -1)
         first[look[::-1]] = np.arange(len(look))[::-1]
         return ask(channel, cardinality, replace(seen, pattern=look)), told[first]
 
@@ -173,14 +174,14 @@ class PlaneTable:
     def split(self, asked: Sequence[Question], table: Bools, numbers: Ints) -> list[Search]:
         """Splits by columns of a table, which have these numbers among the relative ones."""
         kinds = column_kinds(self.columns)[numbers]
-        found = find_splits([q.head for q in asked], table, kinds, self.n_actions, self.in_pairs)
+        found = find_splits([q.head for q in asked], table, kinds, self.acts.n_ways, self.in_pairs)
         return [search.renamed(numbers) for search in found]
 
     def build(self, asked: Sequence[Question], found: Sequence[Search]) -> Graphs:
         """Graphs of channels, ``terminated`` and the event that never happens."""
         seen = [self.seen(channel) for channel in range(len(self.cardinalities))]
-        habits = [habit_of(k, self.n_actions, s.actions, s.now, s.then) for k, s in zip(self.cardinalities, seen, strict=True)]
+        habits = [habit_of(k, self.acts.n_ways, s.actions, s.now, s.then) for k, s in zip(self.cardinalities, seen, strict=True)]
         nothing, ends = np.zeros(len(self.rows), dtype=np.int64), self.rows.terminated.astype(np.int64)
-        habits += [habit_of(2, self.n_actions, self.rows.actions, nothing, then) for then in (ends, nothing)]
+        habits += [habit_of(2, self.acts.n_ways, self.acts.way[self.rows.actions], nothing, then) for then in (ends, nothing)]
         still = 0.5 / (len(self.actions) * len(self.cardinalities) + 1.0)
-        return build(channel_layout(self.cardinalities, self.n_actions), asked, found, habits, still)
+        return build(channel_layout(self.cardinalities, self.acts), asked, found, habits, still)

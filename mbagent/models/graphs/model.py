@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +17,7 @@ from mbagent.models.base import (
     Floats,
 )
 from mbagent.models.fit_report import Variable, VariableReport, describe
+from mbagent.models.graphs.acts import acts_of
 from mbagent.models.graphs.arrays import from_arrays, table_of, to_arrays
 from mbagent.models.graphs.compiled import Graphs, build, habit_of, n_columns
 from mbagent.models.graphs.conditioner import AT_ONCE
@@ -68,15 +70,25 @@ class DecisionGraphModel(GraphPredictions):
         n_actions: number of enumerated actions A.
         validation: share of episodes held out, for the report and for the choice whether there are rare events; the
             graphs are fitted to all rows in the end.
+        parts: number of values of each part of an action, such as (2, 2, 2) for three switches, numbered as
+            ``ActionEnumeration`` does; each part is a cause for itself then. None: an action is one thing.
+
+    Raises:
+        ValueError: so many parts do not make so many actions.
     """
 
-    def __init__(self, cardinalities: tuple[int, ...], n_actions: int, validation: float = 0.1) -> None:
+    def __init__(
+        self, cardinalities: tuple[int, ...], n_actions: int, validation: float = 0.1, parts: Sequence[int] | None = None
+    ) -> None:
         """See the class."""
         super().__init__(cardinalities, n_actions)
-        self.validation = validation
-        layout = lay_out(self.cardinalities, (), n_actions)
+        self.validation, self.parts = validation, (n_actions,) if parts is None else tuple(parts)
+        if math.prod(self.parts) != n_actions:
+            raise ValueError(f"Actions with {self.parts} values of their parts are {math.prod(self.parts)}, not {n_actions}.")
+        self.acts = acts_of(self.parts)
+        layout = lay_out(self.cardinalities, (), self.acts)
         none = np.zeros(0, dtype=np.int64)
-        nothing = build(layout, (), (), [habit_of(int(n), n_actions, none, none, none) for n in layout.outputs], 1e-9)
+        nothing = build(layout, (), (), [habit_of(int(n), self.acts.n_ways, none, none, none) for n in layout.outputs], 1e-9)
         self.fitted = Fitted(layout, nothing, nothing_late(nothing), nothing, False, (), ())
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
@@ -90,12 +102,12 @@ class DecisionGraphModel(GraphPredictions):
             progress(0.4)
         flagged = flag_events(train.before, train.after) & events.any()
         moving = self._moving(train, flagged, held_out)
-        self.fitted = fit_graphs(self.cardinalities, self.n_actions, train, flagged, moving=moving, since=train_since)
+        self.fitted = fit_graphs(self.cardinalities, self.acts, train, flagged, moving=moving, since=train_since)
         likelihood, jointly = self._jointly(held_out)
         if progress is not None:
             progress(0.7)
         exact, (variables, calibration) = self._exact_match(held_out), self._described(held_out)
-        self.fitted = fit_graphs(self.cardinalities, self.n_actions, rows, events, True, jointly, moving, since)
+        self.fitted = fit_graphs(self.cardinalities, self.acts, rows, events, True, jointly, moving, since)
         if progress is not None:
             progress(1.0)
         figures = {"nodes": float(len(self.fitted.usual.column)), "events": float(events.sum())}
@@ -169,8 +181,8 @@ class DecisionGraphModel(GraphPredictions):
         logs = self._foretold(known[0], tests[0])
         if logs.mean() > FORETOLD:
             return 0.0
-        space, longer = with_past(*known, self.cardinalities, self.n_actions, self._planes())
-        _, longer_tests = with_past(*tests, self.cardinalities, self.n_actions, self._planes())
+        space, longer = with_past(*known, self.cardinalities, self.acts, self._planes())
+        _, longer_tests = with_past(*tests, self.cardinalities, self.acts, self._planes())
         further = self._with_memory(space)._foretold(longer, longer_tests)
         gain = float((further - logs).mean())
         return gain if better(further, logs) and gain > WORTH * (1.0 - logs.mean()) else 0.0
@@ -179,7 +191,7 @@ class DecisionGraphModel(GraphPredictions):
         return None
 
     def _with_memory(self, space: FactoredSpace) -> DecisionGraphModel:
-        return DecisionGraphModel(space.cardinalities, self.n_actions)
+        return DecisionGraphModel(space.cardinalities, self.n_actions, parts=self.parts)
 
     def _foretold(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
         """Log-probabilities of transitions after a quick look at others; what was learned stays as it is."""
@@ -192,7 +204,7 @@ class DecisionGraphModel(GraphPredictions):
     def _look(self, rows: TransitionBatch) -> None:
         """Learns quickly."""
         events = flag_events(rows.before, rows.after) & self.fitted.has_event
-        self.fitted = fit_graphs(self.cardinalities, self.n_actions, rows, events, True, False)
+        self.fitted = fit_graphs(self.cardinalities, self.acts, rows, events, True, False)
 
     def _kept(self) -> Any:
         return self.fitted
@@ -230,7 +242,7 @@ class DecisionGraphModel(GraphPredictions):
             train, held_out = data.split(self.validation, seed + split)
             seen = flag_events(train.before, train.after)
             with_events, without = (
-                self._likelihood(fit_graphs(self.cardinalities, self.n_actions, train, flags, False, False), held_out)
+                self._likelihood(fit_graphs(self.cardinalities, self.acts, train, flags, False, False), held_out)
                 for flags in (seen, np.zeros_like(seen))
             )
             gain += (with_events - without) * len(held_out)
@@ -241,13 +253,13 @@ class DecisionGraphModel(GraphPredictions):
 
     def _moving(self, train: TransitionBatch, events: Bools, held_out: TransitionBatch) -> list[int]:
         """Factors of which held-out values are foretold better by asking how far they move than where they go."""
-        n_contexts, n_columns = self.n_actions * max(self.cardinalities, default=0), 2 * sum(self.cardinalities)
+        n_contexts, n_columns = self.acts.n_ways * max(self.cardinalities, default=0), 2 * sum(self.cardinalities)
         every = [f for f, cardinality in enumerate(self.cardinalities) if cardinality > 2]
         if not every or n_contexts * n_columns > MOST_COUNTS or len(held_out) == 0:
             return []
         start, logs = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64), []
         for moving in ((), every):
-            self.fitted = fit_graphs(self.cardinalities, self.n_actions, train, events, False, False, moving)
+            self.fitted = fit_graphs(self.cardinalities, self.acts, train, events, False, False, moving)
             probs = self.marginals(held_out.states, held_out.actions)
             chosen = np.take_along_axis(probs, start[every] + held_out.after[:, every], axis=1)
             logs.append(np.log(chosen.clip(1e-9)).sum(axis=0))
@@ -304,7 +316,7 @@ class DecisionGraphModel(GraphPredictions):
             raise ValueError(
                 "These weights group other bits than this model has; load them into a model of the same environment."
             )
-        layout = lay_out(self.cardinalities, groups, self.n_actions)
+        layout = lay_out(self.cardinalities, groups, self.acts)
         couplings = np.asarray(state["couplings"], dtype=np.int64).reshape(-1)
         coupled = np.flatnonzero(couplings >= 0)
         if len(couplings) != len(layout.outputs) or not is_lone_bit(layout)[coupled].all():

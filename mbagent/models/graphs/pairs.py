@@ -10,10 +10,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mbagent.models.graphs.evidence import Floats, Head, Ints, Tables, evidences
+from mbagent.models.graphs.evidence import Floats, Head, Ints, Tables, evidence, evidences
 from mbagent.models.graphs.search import Bools, Pair, Search
+from mbagent_envs._compiled import compiled
 
 PATTERNS: tuple[tuple[bool, bool, bool, bool], ...] = (
     (False, False, False, True),
@@ -48,6 +48,9 @@ MOST_COLUMNS = 500
 
 EXACT = 2**24
 """Sums up to here are exact in single precision."""
+
+SPARSE = 16.0
+"""Pairs of columns that are on are counted one by one where a matrix product would take so many times as many steps."""
 
 
 class PairSearch:
@@ -151,17 +154,9 @@ def _telling_most(table: Bools, seen: Ints, came: Ints, tables: Tables) -> Ints:
 def _in_context(
     context: int, table: Bools, seen: Ints, came: Ints, prior: Floats, patterns: Floats, tables: Tables
 ) -> list[Pair]:
-    on = table.astype(np.float32)
-    cells_n, cells_e = _cells(on, seen), _cells(on, came)
-    n, e = int(seen.sum()), int(came.sum())
-    best, which = np.full(prior.shape, -np.inf), np.zeros(prior.shape, dtype=np.int64)
-    for number, pattern in enumerate(PATTERNS):
-        inside_n, inside_e = _inside(cells_n, pattern), _inside(cells_e, pattern)
-        gain = patterns[number] + evidences(inside_e, inside_n, tables) + evidences(e - inside_e, n - inside_n, tables)
-        which[gain > best] = number
-        np.maximum(best, gain, out=best)
-    best += np.triu(prior, 1) - evidences(np.asarray(e), np.asarray(n), tables)
-    best[np.tril_indices(len(best))] = -np.inf
+    arrived = came > 0
+    both_n, both_e = _both(table, seen), _both(table[arrived], came[arrived])
+    best, which = _best_patterns(both_n, both_e, int(seen.sum()), int(came.sum()), np.asarray(PATTERNS), patterns, prior, tables)
     pairs: list[Pair] = []
     while best.size and (top := float(best.max())) > 0.0:
         first, second = (int(i) for i in np.unravel_index(int(best.argmax()), best.shape))
@@ -173,18 +168,58 @@ def _in_context(
     return pairs
 
 
-def _cells(on: NDArray[np.float32], weights: Ints) -> tuple[Ints, Ints, Ints, Ints]:
-    """Weight of the rows in which neither, the second only, the first only, both of two columns are on, int64 [D, D] each."""
+def _both(on: Bools, weights: Ints) -> Ints:
+    """Weight of the rows in which both of two columns are on, int64 [D, D]; only the upper triangle counts."""
+    per_row = on.sum(axis=1)
+    if SPARSE * float((per_row**2).sum()) < float(on.size) * on.shape[1]:
+        first = np.concatenate([[0], np.cumsum(per_row)]).astype(np.int64)
+        result: Ints = _count_both(first, np.nonzero(on)[1], weights, on.shape[1])
+        return result
     exact = np.float32 if weights.sum() < EXACT else np.float64
-    both = np.rint((on * weights[:, None]).astype(exact).T @ on.astype(exact)).astype(np.int64)
-    single = np.diag(both)
-    first, second = single[:, None] - both, single[None, :] - both
-    return int(weights.sum()) - both - first - second, second, first, both
+    wide = on.astype(exact)
+    product: Ints = np.rint((wide * weights[:, None].astype(exact)).T @ wide).astype(np.int64)
+    return product
 
 
-def _inside(cells: Sequence[Ints], pattern: Sequence[bool]) -> Ints:
-    total = np.zeros_like(cells[0])
-    for cell, chosen in zip(cells, pattern, strict=True):
-        if chosen:
-            total += cell
-    return total
+@compiled
+def _count_both(first: Ints, column: Ints, weights: Ints, n_columns: int) -> Ints:
+    """As ``_both``, of columns in compressed rows, ascending in each."""
+    both = np.zeros((n_columns, n_columns), dtype=np.int64)
+    for r in range(len(weights)):
+        for i in range(first[r], first[r + 1]):
+            for j in range(i, first[r + 1]):
+                both[column[i], column[j]] += weights[r]
+    return both
+
+
+@compiled
+def _best_patterns(
+    both_n: Ints, both_e: Ints, n: int, e: int, inside: Bools, patterns: Floats, prior: Floats, tables: Tables
+) -> tuple[Floats, Ints]:
+    """Evidence beyond its price of each pair of columns under its best pattern, [D, D], and the pattern's number.
+
+    Below the diagonal and on it there are no pairs.
+    """
+    one, two, alike = tables
+    size = len(both_n)
+    best, which = np.full((size, size), -math.inf), np.zeros((size, size), dtype=np.int64)
+    cells_n, cells_e, before = np.zeros(4, dtype=np.int64), np.zeros(4, dtype=np.int64), evidence(e, n, one, two, alike)
+    for i in range(size):
+        for j in range(i + 1, size):
+            for cells, both, total in ((cells_n, both_n, n), (cells_e, both_e, e)):
+                cells[3] = both[i, j]
+                cells[2] = both[i, i] - both[i, j]
+                cells[1] = both[j, j] - both[i, j]
+                cells[0] = total - cells[1] - cells[2] - cells[3]
+            for number in range(len(inside)):
+                n_in, e_in = 0, 0
+                for cell in range(4):
+                    if inside[number, cell]:
+                        n_in += cells_n[cell]
+                        e_in += cells_e[cell]
+                gain = patterns[number] + evidence(e_in, n_in, one, two, alike)
+                gain += evidence(e - e_in, n - n_in, one, two, alike)
+                if gain > best[i, j]:
+                    best[i, j], which[i, j] = gain, number
+            best[i, j] += prior[i, j] - before
+    return best, which

@@ -30,7 +30,7 @@ def hangs_on_action(graphs: Graphs, unit: int, layout: Layout) -> bool:
         entries = range(graphs.entries[first + pair], graphs.entries[first + pair + 1])
         return [(int(graphs.values[e]), int(graphs.nodes[e])) for e in entries]
 
-    return any(ways(action * n + value) != ways(value) for value in range(n) for action in range(1, layout.n_actions))
+    return any(ways(way * n + value) != ways(value) for value in range(n) for way in range(1, layout.acts.n_ways))
 
 
 def parent_factors(layout: Layout, columns: set[int]) -> set[int]:
@@ -40,7 +40,7 @@ def parent_factors(layout: Layout, columns: set[int]) -> set[int]:
 
 def flat_variables(layout: Layout, graphs: Graphs, late: Graphs) -> list[Variable]:
     """Factors and groups that have graphs, and what they hang on besides themselves."""
-    n, after, found = len(layout.factor), len(layout.factor) + layout.n_actions, []
+    n, after, found = len(layout.factor), len(layout.factor) + layout.acts.n_columns, []
     for unit in graphs.changing[graphs.changing < len(layout.outputs) - 2]:
         factors = tuple(int(f) for f in layout.members[layout.first[unit] : layout.first[unit + 1]])
         name = f"factor {factors[0]}" if len(factors) == 1 else f"factors {factors[0]}, {factors[1]}, …"

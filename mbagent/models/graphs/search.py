@@ -26,6 +26,9 @@ from mbagent.models.graphs.evidence import (
 
 Bools: TypeAlias = NDArray[np.bool_]
 
+MOST_KEPT = 100_000
+"""Counts that a head keeps from one look to the next, 16 bytes each; more are counted anew."""
+
 
 class Pair(NamedTuple):
     """A context told apart by two columns.
@@ -93,10 +96,13 @@ class Search:
         return n, e
 
     def tally(self, columns: Columns) -> Tally:
-        """Counts of each context with each column on, made once."""
-        if self._tally is None:
-            self._tally = count(self.head, columns)
-        return self._tally
+        """Counts of each context with each column on, made once where they are few."""
+        if self._tally is not None:
+            return self._tally
+        tally = count(self.head, columns)
+        if tally.on.size <= MOST_KEPT:
+            self._tally = tally
+        return tally
 
     def merge(self, tables: Tables) -> None:
         """Lets all contexts share one rate where that has more evidence, as a split by no column would."""

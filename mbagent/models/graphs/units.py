@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.base import hash_rows
+from mbagent.models.graphs.acts import Acts, shown_acts
 from mbagent.models.graphs.evidence import Head
 from mbagent.transitions import Factors
 from mbagent_envs.random_keys import derive
@@ -36,12 +37,12 @@ class Layout(NamedTuple):
         members: factors of each unit; several for a group, one for a factor, none for the last two.
         factor, value, top: what each state column stands for, int64 [D']: that a factor's value lies from ``value`` to ``top``.
         n_factors: number of factors F.
-        n_actions: number of actions A.
+        acts: which columns actions have on, K in all, and which are told apart from the start.
         cells: where the observation is a stack of planes, the factor of each channel in each row and column, int64 [C, H, W];
             else empty.
         meetings: columns that are on where, anywhere on the planes, a channel has a value and so has another (or the same) so
             many rows below and columns to the right: (channel, value, channel, value, rows, columns), int64 [M, 6].
-            D = D' + A + M columns in all.
+            D = D' + K + M columns in all.
         coupled_first: where each coupling's units begin in ``coupled``, int64 [Q + 1].
         coupled: units, all bits, of which at most one is on after a step.
         exactly: whether it is exactly one, bool [Q].
@@ -55,7 +56,7 @@ class Layout(NamedTuple):
     value: Ints
     top: Ints
     n_factors: int
-    n_actions: int
+    acts: Acts
     cells: Ints
     meetings: Ints
     next_meetings: Ints
@@ -69,13 +70,13 @@ MOST_STEPS = 128
 """Columns "at least so much" of one factor; of more values, evenly spaced ones have one."""
 
 
-def lay_out(cardinalities: Sequence[int], groups: Sequence[Sequence[int]], n_actions: int, ordinal: bool = True) -> Layout:
+def lay_out(cardinalities: Sequence[int], groups: Sequence[Sequence[int]], acts: Acts, ordinal: bool = True) -> Layout:
     """Units of factors: the groups first, then all other factors in their order, then ``terminated`` and the event.
 
     Args:
         cardinalities: number of values of each factor.
         groups: factors of each group.
-        n_actions: number of actions A.
+        acts: the actions.
         ordinal: whether there are columns for a factor having at least some value.
     """
     grouped = {f for group in groups for f in group}
@@ -91,7 +92,7 @@ def lay_out(cardinalities: Sequence[int], groups: Sequence[Sequence[int]], n_act
         np.ascontiguousarray(value),
         np.ascontiguousarray(top),
         len(cardinalities),
-        int(n_actions),
+        acts,
         np.zeros((0, 0, 0), dtype=np.int64),
         np.zeros((0, 6), dtype=np.int64),
         np.zeros((0, 6), dtype=np.int64),
@@ -151,7 +152,7 @@ def unit_values(layout: Layout, states: Factors) -> Factors:
 def column_table(layout: Layout, states: Factors, actions: Ints) -> Bools:
     """Which columns are on, bool [B, D]: those of states [B, F], then those of actions [B]."""
     return np.concatenate(
-        [shown(layout, states), actions[:, None] == np.arange(layout.n_actions)],
+        [shown(layout, states), shown_acts(layout.acts, actions)],
         axis=1,
     )
 
@@ -168,7 +169,7 @@ def column_kinds(layout: Layout, states: Factors, changing: Bools) -> Ints:
         changing: which factors change, bool [F].
     """
     n_columns = len(layout.factor)
-    kinds = np.zeros(n_columns + layout.n_actions, dtype=np.int64)
+    kinds = np.zeros(n_columns + layout.acts.n_columns, dtype=np.int64)
     kinds[n_columns:] = 1
     of_factor = np.full(layout.n_factors, -1)
     for unit in np.flatnonzero(np.diff(layout.first) * (layout.outputs > 2)):
@@ -211,7 +212,7 @@ class Seen:
 
     Attributes:
         pattern: number of each row's look, action included, int64 [N]; rows of one look have one present value.
-        actions: int64 [N].
+        actions: the ways of the actions, see ``Acts``, int64 [N].
         now: a unit's present values, int64 [N].
         then: those that follow, int64 [N].
     """

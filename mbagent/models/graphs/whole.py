@@ -71,8 +71,8 @@ def whole_work(kernel: WholeKernel, n_grid: int) -> WholeWork:
         np.empty(n_columns(layout), dtype=np.bool_),
         np.empty(len(layout.outputs), dtype=np.int64),
         np.empty(kernel.usual.start[-1], dtype=np.float64),
-        np.arange(layout.n_actions),
-        np.empty((layout.n_actions, layout.n_factors), dtype=np.int64),
+        np.arange(len(layout.acts.way)),
+        np.empty((len(layout.acts.way), layout.n_factors), dtype=np.int64),
         np.array([len(layout.outputs) - 1]),
     )
 
@@ -87,7 +87,7 @@ def whole_outcomes(
     states[:] = state
     found = successors(states, actions, layout, graphs, kernel.late, n_grid, key, offset)
     begins = 0
-    for action in range(layout.n_actions):
+    for action in range(len(layout.acts.way)):
         rate = 0.0
         if kernel.has_event:
             show(state, action, layout, work.on)

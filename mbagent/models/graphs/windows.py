@@ -13,6 +13,7 @@ from typing import NamedTuple, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent.models.graphs.acts import act_columns
 from mbagent.models.graphs.units import BEYOND
 from mbagent.transitions import Factors
 from mbagent_envs._compiled import compiled
@@ -26,7 +27,7 @@ CELL, BORDER, ACTION, MEETING, NEXT, WRAP, NEXT_MEETING = 0, 1, 2, 3, 4, 5, 6
 
 - CELL: channel, value, rows below, columns to the right;
 - BORDER: rows below, columns to the right;
-- ACTION: action;
+- ACTION: number of the column, and the actions that have it on: stride, n, value, see ``acts.act_columns``;
 - MEETING: channel, value, channel (``BEYOND``: what lies beyond the border), value, rows below, columns to the right;
 - NEXT, NEXT_MEETING: a CELL and a MEETING of the next state;
 - WRAP: a CELL that lies beyond the border, and so at the other end.
@@ -52,12 +53,12 @@ NEXT_RADIUS = 2
 """Rows and columns that a neighbourhood in the next state reaches: two places that a thing may go to lie so far apart."""
 
 
-def relative_columns(cardinalities: Sequence[int], n_actions: int, reach: Reach) -> Ints:
+def relative_columns(cardinalities: Sequence[int], parts: Sequence[int], reach: Reach) -> Ints:
     """All relative columns, int64 [D, 7]; see above.
 
     Args:
         cardinalities: number of values of each channel's cells, length C.
-        n_actions: number of actions A.
+        parts: number of values of each part of an action.
         reach: of neighbourhoods.
     """
     near = range(-reach.radius, reach.radius + 1)
@@ -65,7 +66,7 @@ def relative_columns(cardinalities: Sequence[int], n_actions: int, reach: Reach)
     shown = [(c, v) for c, k in enumerate(cardinalities) for v in (range(k) if k != 2 else (1,))]
     columns = [(CELL, c, v, dy, dx, 0, 0) for dy, dx in offsets for c, v in shown]
     columns += [(BORDER, dy, dx, 0, 0, 0, 0) for dy, dx in offsets if (dy, dx) != (0, 0)]
-    columns += [(ACTION, action, 0, 0, 0, 0, 0) for action in range(n_actions)]
+    columns += [(ACTION, number, *column, 0, 0) for number, column in enumerate(act_columns(parts))]
     meetings = list(_meetings(shown))
     columns += [(MEETING, *meeting) for meeting in meetings]
     further = range(-NEXT_RADIUS, NEXT_RADIUS + 1)
@@ -147,7 +148,7 @@ def told_by(channel: int, columns: Ints, numbers: Ints, before: Factors, after: 
             told: Ints = here[columns[here, 1] == other]
             return told
     for number in numbers[columns[numbers, 0] == ACTION]:
-        taken = (actions == columns[number, 1])[:, None, None]
+        taken = _acts(columns[number], actions)[:, None, None]
         if _repeats(after[:, channel], np.broadcast_to(taken, after[:, channel].shape).astype(after.dtype)):
             return np.asarray([number])
     return None
@@ -174,7 +175,7 @@ def column_planes(columns: Ints, planes: Factors, actions: Ints, after: Factors 
         if kind == BORDER:
             table[d] = ~shifted(inside[None], parts[0], parts[1])
         elif kind == ACTION:
-            table[d] = (actions == parts[0])[:, None, None]
+            table[d] = _acts(columns[d], actions)[:, None, None]
         elif kind in (MEETING, NEXT_MEETING):
             table[d] = far_value(columns[d], planes, actions, after)[:, None, None]
         else:
@@ -233,10 +234,16 @@ def _shown(kind: int, planes: Factors, after: Factors | None) -> Factors:
     return after
 
 
+def _acts(column: Ints, actions: Ints) -> Bools:
+    """Whether each action [N] has a column on."""
+    on: Bools = actions // column[2] % column[3] == column[4]
+    return on
+
+
 def far_value(column: Ints, planes: Factors, actions: Ints, after: Factors | None) -> Bools:
     """As ``column_values``, for a column that is the same at all positions, bool [N]."""
     kind = int(column[0])
-    return actions == column[1] if kind == ACTION else meets(_shown(kind, planes, after), column[1:])
+    return _acts(column, actions) if kind == ACTION else meets(_shown(kind, planes, after), column[1:])
 
 
 def shifted(plane: NDArray[_T], below: int, right: int) -> NDArray[_T]:
@@ -279,7 +286,9 @@ def named_column(column: Ints) -> str:
     """A relative column in words."""
     kind, *parts = (int(part) for part in column)
     if kind == ACTION:
-        return f"action {parts[0]}"
+        return (
+            f"action {parts[3]}" if parts[1] == 1 and parts[0] == parts[3] else f"action // {parts[1]} % {parts[2]} = {parts[3]}"
+        )
     if kind == BORDER:
         return f"border at ({parts[0]:+d}, {parts[1]:+d})"
     if kind in (MEETING, NEXT_MEETING):

@@ -72,10 +72,10 @@ class _Followed:
         self.planes, self.question, self.channel = planes, question, question.unit
         self.splits: list[Split] = []
         cardinality = planes.cardinalities[self.channel]
-        context = np.full(planes.n_actions * cardinality, -1, dtype=np.int32)
+        context = np.full(planes.acts.n_ways * cardinality, -1, dtype=np.int32)
         context[question.pairs] = np.arange(len(question.pairs))
         now = planes.every[0][:, self.channel].reshape(len(planes.every_action), -1)
-        self.context = context[(planes.every_action * cardinality)[:, None] + now].ravel()
+        self.context = context[(planes.acts.way[planes.every_action] * cardinality)[:, None] + now].ravel()
         self.context[: planes.every_since[self.channel] * planes.n_cells] = -1
         self.action, self.value, self.typical = search.head.action, search.head.value, search.typical
         self.closed = np.zeros(len(self.action), dtype=np.bool_)
@@ -163,7 +163,7 @@ def _round(planes: PlaneTable, followed: Sequence[_Followed], most: int, certain
     table = values_at(planes.columns[planes.near], planes.every[0], planes.every_action, rows, cells // width, cells % width)
     kinds = column_kinds(planes.columns)[planes.near]
     tables = evidence_tables(len(table) + 1, certain)
-    go_on(every, table, columns_of(table), kinds, planes.n_actions, tables, planes.in_pairs)
+    go_on(every, table, columns_of(table), kinds, planes.acts.n_ways, tables, planes.in_pairs)
     grown = [each.graft(some, contexts, planes.near) for each, some, contexts in zip(followed, searches, opened, strict=True)]
     return any(grown)
 

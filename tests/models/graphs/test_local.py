@@ -38,7 +38,7 @@ def planes(*shape: int) -> FactoredSpace:
 def test_columns_are_what_lies_around_each_position() -> None:
     rng = np.random.default_rng(0)
     board, actions = rng.integers(2, size=(4, 2, 3, 5)), rng.integers(3, size=4)
-    columns = relative_columns((2, 2), 3, Reach(1, wrap=True))
+    columns = relative_columns((2, 2), (3,), Reach(1, wrap=True))
     after = rng.integers(2, size=board.shape)
     table = column_values(columns, board, actions, after).reshape(4, 3, 5, len(columns))
 

@@ -22,7 +22,7 @@ from tests.models.helpers import played
 def test_columns_of_some_cells_are_those_of_all() -> None:
     rng = np.random.default_rng(0)
     planes, actions = rng.integers(2, size=(6, 2, 3, 5)).astype(np.uint8), rng.integers(3, size=6)
-    columns = relative_columns((2, 2), 3, Reach(1, wrap=True))
+    columns = relative_columns((2, 2), (3,), Reach(1, wrap=True))
     columns = columns[~np.isin(columns[:, 0], (NEXT, NEXT_MEETING))]
     cells = rng.permutation(6 * 15)[:40]
     found = values_at(columns, planes, actions, cells // 15, cells % 15 // 5, cells % 5)
