@@ -25,7 +25,7 @@ from mbagent.arguments import (
 )
 from mbagent.experience import Experience, ExperienceRecorder, distinct_rows
 from mbagent.explanations import Explanation, explain
-from mbagent.exploration import EXPLORATIONS, Exploration
+from mbagent.exploration import EXPLORATIONS, Exploration, Watching
 from mbagent.goals import GoalBook
 from mbagent.learned_reward import LearnedReward
 from mbagent.models.base import FitReport, TransitionModel
@@ -295,11 +295,11 @@ class ModelLearningAgent(SavableAlgorithm):
 
     def _explore(self, until: int, callback: BaseCallback, recorder: ExperienceRecorder) -> bool:
         """Steps all environments until ``num_timesteps`` reaches ``until``; False if a callback stopped it."""
-        env = cast("VecEnv", self.env)
+        env, watching = cast("VecEnv", self.env), isinstance(self._explorer, Watching)
         callback.on_rollout_start()
         while self.num_timesteps < until:
             assert recorder.states is not None
-            indices = self._explorer.act(self.policy.factored.narrow(recorder.states), self._rng)
+            indices = self._explorer.act(recorder.states, self._rng)
             actions = self.policy.actions.decode(indices)
             new_obs, rewards, dones, infos = env.step(actions)
             self.num_timesteps += env.num_envs
@@ -308,7 +308,9 @@ class ModelLearningAgent(SavableAlgorithm):
                     self._vec_normalize_env.get_original_obs(),
                     self._vec_normalize_env.get_original_reward(),
                 )
-            recorder.record(indices, new_obs, rewards, dones, infos)
+            step = recorder.record(indices, new_obs, rewards, dones, infos)
+            if watching:
+                self._explorer.observe(step.states, step.actions, step.next_states, dones)
             self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]  # Tuple spaces too
             self._update_info_buffer(infos, dones)
             self._episode_num += int(dones.sum())

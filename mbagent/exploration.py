@@ -3,19 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.base import Actions, States
+from mbagent.models.base import Actions, Bools, States
+from mbagent.visits import START, VisitTable
+
+FEW_STATES, STEPS_PER_STATE = 64, 8
+"""States are few enough for a table where there are so many at most, and one more for each so many steps."""
+
+MANY_STATES = 50_000
+"""More than this are not kept in a table."""
+
+TOGETHER = 256
+"""Steps that are counted at once while they direct nothing."""
 
 
 class Exploration(Protocol):
     """Chooses the actions of the learning phase."""
 
     def act(self, states: States, rng: np.random.Generator) -> Actions:
-        """Action numbers int64 [B] for states int64 [B, F]."""
+        """Action numbers int64 [B] for states int64 [B, F], numbered as declared (see FactoredSpace)."""
+        ...
+
+
+@runtime_checkable
+class Watching(Protocol):
+    """An exploration that is told what its actions led to; never a reward."""
+
+    def observe(self, states: States, actions: Actions, next_states: States, ended: Bools) -> None:
+        """A step of each environment.
+
+        Args:
+            states: int64 [B, F], numbered as declared.
+            actions: int64 [B].
+            next_states: int64 [B, F], where an episode ended its last.
+            ended: whether the episode ended there, by the world's rules or by a limit of steps, bool [B].
+        """
         ...
 
 
@@ -66,8 +92,67 @@ class PersistentExploration:
         return new.copy()
 
 
+class DirectedExploration:
+    """To what was tried least, as long as states are few enough to keep count of; else every action equally often.
+
+    Where random steps seldom get far (holes, cliffs, long corridors, things that need several steps in the right order), it is far
+    ahead of them. It needs states that are met again: a table of visits says nothing about a state never seen. They count as
+    few while no more than FEW_STATES + steps / STEPS_PER_STATE different ones were met; while they are more, and for good
+    from MANY_STATES on, actions are drawn as RandomExploration draws them.
+
+    Args:
+        n_actions: number of enumerated actions.
+
+    Attributes:
+        table: what was tried; None once there were too many states.
+        n_steps: steps observed.
+    """
+
+    def __init__(self, n_actions: int) -> None:
+        """See the class."""
+        self.table: VisitTable | None = VisitTable(n_actions)
+        self.n_steps = 0
+        self._random = RandomExploration(n_actions)
+        self._waiting: list[tuple[NDArray[Any], ...]] = []
+        self._ended = np.ones(0, dtype=np.bool_)
+
+    @property
+    def directed(self) -> bool:
+        """Whether the states met are few enough."""
+        return self.table is not None and len(self.table) <= FEW_STATES + self.n_steps / STEPS_PER_STATE
+
+    def act(self, states: States, rng: np.random.Generator) -> NDArray[np.int64]:
+        """See Exploration."""
+        if self.table is None or not self.directed:
+            return self._random.act(states, rng)
+        return self.table.choose(self.table.add(states), rng.random((len(states), self._random.n_actions)))
+
+    def observe(self, states: States, actions: Actions, next_states: States, ended: Bools) -> None:
+        """See Watching."""
+        self.n_steps += len(actions)
+        if self.table is None:
+            return
+        began = self._ended if len(self._ended) == len(ended) else np.ones(len(ended), dtype=np.bool_)
+        self._ended = np.array(ended, dtype=np.bool_)
+        self._waiting.append((states, actions, next_states, self._ended, began))
+        if self.directed or len(self._waiting) >= TOGETHER:  # counting many steps at once costs less for each
+            self._count(self.table)
+
+    def _count(self, table: VisitTable) -> None:
+        """Enters what waits into the table."""
+        states, actions, next_states, ended, began = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
+        self._waiting = []
+        nodes, targets = table.add(states), np.full(len(states), START)
+        targets[~ended] = table.add(next_states[~ended])
+        table.begin(nodes[began])
+        table.record(nodes, actions, targets)
+        if len(table) > MANY_STATES:
+            self.table = None
+
+
 EXPLORATIONS: dict[str, Callable[[int], Exploration]] = {
-    "auto": RandomExploration,
+    "auto": DirectedExploration,
+    "directed": DirectedExploration,
     "random": RandomExploration,
     "persistent": PersistentExploration,
 }
