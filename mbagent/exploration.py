@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.base import Actions, Bools, States
+from mbagent.transitions import TransitionDataset
 from mbagent.visits import START, VisitTable
 
 FEW_STATES, STEPS_PER_STATE = 64, 8
@@ -93,37 +95,40 @@ class PersistentExploration:
 
 
 class DirectedExploration:
-    """To what was tried least, as long as states are few enough to keep count of; else every action equally often.
+    """To what was tried least, by counts over all states met; where there are too many states, every action equally often.
 
-    Where random steps seldom get far (holes, cliffs, long corridors, things that need several steps in the right order), it is far
-    ahead of them. It needs states that are met again: a table of visits says nothing about a state never seen. They count as
-    few while no more than FEW_STATES + steps / STEPS_PER_STATE different ones were met; while they are more, and for good
-    from MANY_STATES on, actions are drawn as RandomExploration draws them.
+    Where random steps seldom get far (holes, cliffs, long corridors, things that take several steps in the right order), it is
+    far ahead of them. It needs states that are met again: a table of visits says nothing about a state never seen.
 
     Args:
         n_actions: number of enumerated actions.
+        few: True to be directed only while states are few: no more than FEW_STATES + steps / STEPS_PER_STATE different ones
+            met; False to be directed up to MANY_STATES. Otherwise actions are drawn as RandomExploration draws them.
 
     Attributes:
-        table: what was tried; None once there were too many states.
+        table: what was tried; None once there were more than MANY_STATES.
         n_steps: steps observed.
     """
 
-    def __init__(self, n_actions: int) -> None:
+    def __init__(self, n_actions: int, few: bool = False) -> None:
         """See the class."""
         self.table: VisitTable | None = VisitTable(n_actions)
         self.n_steps = 0
-        self._random = RandomExploration(n_actions)
+        self._few, self._random = few, RandomExploration(n_actions)
         self._waiting: list[tuple[NDArray[Any], ...]] = []
+        self._n_counted = 0
         self._ended = np.ones(0, dtype=np.bool_)
 
     @property
     def directed(self) -> bool:
-        """Whether the states met are few enough."""
-        return self.table is not None and len(self.table) <= FEW_STATES + self.n_steps / STEPS_PER_STATE
+        """Whether it looks for what was tried least at present."""
+        if self.table is None:
+            return False
+        return not self._few or len(self.table) <= FEW_STATES + self.n_steps / STEPS_PER_STATE
 
     def act(self, states: States, rng: np.random.Generator) -> NDArray[np.int64]:
         """See Exploration."""
-        if self.table is None or not self.directed:
+        if self.table is None or not self.directed:  # the first for the type checker
             return self._random.act(states, rng)
         return self.table.choose(self.table.add(states), rng.random((len(states), self._random.n_actions)))
 
@@ -135,13 +140,13 @@ class DirectedExploration:
         began = self._ended if len(self._ended) == len(ended) else np.ones(len(ended), dtype=np.bool_)
         self._ended = np.array(ended, dtype=np.bool_)
         self._waiting.append((states, actions, next_states, self._ended, began))
-        if self.directed or len(self._waiting) >= TOGETHER:  # counting many steps at once costs less for each
+        if self.directed or self.n_steps - self._n_counted >= TOGETHER:  # counting many steps at once costs less for each
             self._count(self.table)
 
     def _count(self, table: VisitTable) -> None:
         """Enters what waits into the table."""
         states, actions, next_states, ended, began = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
-        self._waiting = []
+        self._waiting, self._n_counted = [], self.n_steps
         nodes, targets = table.add(states), np.full(len(states), START)
         targets[~ended] = table.add(next_states[~ended])
         table.begin(nodes[began])
@@ -150,8 +155,20 @@ class DirectedExploration:
             self.table = None
 
 
+def catch_up(exploration: Exploration, data: TransitionDataset) -> None:
+    """Tells directed exploration of the transitions that it did not see, such as those from a file."""
+    if not isinstance(exploration, DirectedExploration) or exploration.n_steps >= len(data):
+        return
+    rows = data.rows().select(slice(exploration.n_steps, None))
+    rows = rows.select(np.argsort(rows.episodes, kind="stable"))
+    last = np.append(rows.episodes[1:] != rows.episodes[:-1], True)
+    columns = (rows.states, rows.actions, rows.next_states, last)
+    for i in range(len(rows)):
+        exploration.observe(*(column[i : i + 1] for column in columns))
+
+
 EXPLORATIONS: dict[str, Callable[[int], Exploration]] = {
-    "auto": DirectedExploration,
+    "auto": partial(DirectedExploration, few=True),
     "directed": DirectedExploration,
     "random": RandomExploration,
     "persistent": PersistentExploration,

@@ -53,10 +53,11 @@ class VisitArrays(NamedTuple):
 class VisitTable:
     """Counts over all states met, and the way to what was tried least. It has no place for a reward.
 
-    The empirical machine of the states met is solved for a bonus 1 / sqrt(n) for a (state, action) tried n times (as
-    Strehl & Littman 2008, without a reward beside it), by value iteration that goes on a little at every step. Actions never tried are
-    worth more than any others. Where an episode ended, the worth is that of its successor's first states: what is beyond
-    an end would else look like a place where nothing can be found out any more.
+    The empirical machine of the states met is solved for a bonus 1 / sqrt(n) for a (state, action) tried n times (Strehl &
+    Littman 2008, here with no reward beside it), by value iteration that goes on a little at every step. Actions never
+    tried are worth more than any others. Where an episode ended, the worth is that of the states in which episodes begin:
+    an end would else look like a place where nothing can be found out any more. That holds for limits of steps, too: who
+    is stuck until one comes is not stuck for ever.
 
     Args:
         n_actions: number of enumerated actions A.
