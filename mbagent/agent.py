@@ -296,7 +296,7 @@ class ModelLearningAgent(SavableAlgorithm):
 
     def _explore(self, until: int, callback: BaseCallback, recorder: ExperienceRecorder) -> bool:
         """Steps all environments until ``num_timesteps`` reaches ``until``; False if a callback stopped it."""
-        env, watching = cast("VecEnv", self.env), isinstance(self._explorer, Watching)
+        env, watcher = cast("VecEnv", self.env), self._explorer if isinstance(self._explorer, Watching) else None
         callback.on_rollout_start()
         while self.num_timesteps < until:
             assert recorder.states is not None
@@ -307,8 +307,8 @@ class ModelLearningAgent(SavableAlgorithm):
             if (original := self._vec_normalize_env) is not None:
                 new_obs, rewards = original.get_original_obs(), original.get_original_reward()
             step = recorder.record(indices, new_obs, rewards, dones, infos)
-            if watching:
-                self._explorer.observe(step.states, step.actions, step.next_states, dones)
+            if watcher is not None:
+                watcher.observe(step.states, step.actions, step.next_states, dones)
             self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]  # Tuple spaces too
             self._update_info_buffer(infos, dones)
             self._episode_num += int(dones.sum())

@@ -162,9 +162,10 @@ def catch_up(exploration: Exploration, data: TransitionDataset) -> None:
     rows = data.rows().select(slice(exploration.n_steps, None))
     rows = rows.select(np.argsort(rows.episodes, kind="stable"))
     last = np.append(rows.episodes[1:] != rows.episodes[:-1], True)
-    columns = (rows.states, rows.actions, rows.next_states, last)
+    states, next_states = rows.states, rows.next_states
     for i in range(len(rows)):
-        exploration.observe(*(column[i : i + 1] for column in columns))
+        step = slice(i, i + 1)
+        exploration.observe(states[step], rows.actions[step], next_states[step], last[step])
 
 
 EXPLORATIONS: dict[str, Callable[[int], Exploration]] = {
