@@ -96,7 +96,7 @@ class ExperienceRecorder:
         dones: NDArray[Any],
         infos: list[dict[str, Any]],
     ) -> TransitionBatch:
-        """Adds one step of every environment, and returns it.
+        """Adds one step of every environment, and returns it, [B].
 
         Args:
             actions: int64 [B], numbers of the enumerated actions.

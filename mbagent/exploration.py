@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.base import Actions, Bools, States
-from mbagent.transitions import TransitionDataset
+from mbagent.transitions import TransitionBatch, TransitionDataset
 from mbagent.visits import START, VisitTable
 
 FEW_STATES, STEPS_PER_STATE = 64, 8
@@ -134,12 +134,21 @@ class DirectedExploration:
 
     def observe(self, states: States, actions: Actions, next_states: States, ended: Bools) -> None:
         """See Watching."""
+        began = self._ended if len(self._ended) == len(ended) else np.ones(len(ended), dtype=np.bool_)
+        self._ended = np.array(ended, dtype=np.bool_)
+        self._take(states, actions, next_states, self._ended, began)
+
+    def recall(self, rows: TransitionBatch) -> None:
+        """Takes steps that were made without it; all their episodes are over."""
+        rows = rows.select(np.argsort(rows.episodes, kind="stable"))
+        change = rows.episodes[1:] != rows.episodes[:-1]
+        self._take(rows.states, rows.actions, rows.next_states, np.append(change, True), np.append(True, change))
+
+    def _take(self, states: States, actions: Actions, next_states: States, ended: Bools, began: Bools) -> None:
         self.n_steps += len(actions)
         if self.table is None:
             return
-        began = self._ended if len(self._ended) == len(ended) else np.ones(len(ended), dtype=np.bool_)
-        self._ended = np.array(ended, dtype=np.bool_)
-        self._waiting.append((states, actions, next_states, self._ended, began))
+        self._waiting.append((states, actions, next_states, ended, began))
         if self.directed or self.n_steps - self._n_counted >= TOGETHER:  # counting many steps at once costs less for each
             self._count(self.table)
 
@@ -157,15 +166,8 @@ class DirectedExploration:
 
 def catch_up(exploration: Exploration, data: TransitionDataset) -> None:
     """Tells directed exploration of the transitions that it did not see, such as those from a file."""
-    if not isinstance(exploration, DirectedExploration) or exploration.n_steps >= len(data):
-        return
-    rows = data.rows().select(slice(exploration.n_steps, None))
-    rows = rows.select(np.argsort(rows.episodes, kind="stable"))
-    last = np.append(rows.episodes[1:] != rows.episodes[:-1], True)
-    states, next_states = rows.states, rows.next_states
-    for i in range(len(rows)):
-        step = slice(i, i + 1)
-        exploration.observe(states[step], rows.actions[step], next_states[step], last[step])
+    if isinstance(exploration, DirectedExploration) and exploration.n_steps < len(data):
+        exploration.recall(data.rows().select(slice(exploration.n_steps, None)))
 
 
 EXPLORATIONS: dict[str, Callable[[int], Exploration]] = {
