@@ -25,7 +25,7 @@ from mbagent.arguments import (
 )
 from mbagent.experience import Experience, ExperienceRecorder, distinct_rows
 from mbagent.explanations import Explanation, explain
-from mbagent.exploration import EXPLORATIONS, Exploration
+from mbagent.exploration import EXPLORATIONS, Exploration, Watching, catch_up
 from mbagent.goals import GoalBook
 from mbagent.learned_reward import LearnedReward
 from mbagent.models.base import FitReport, TransitionModel
@@ -51,7 +51,7 @@ MAX_START_STATES = 512
 class ModelLearningAgent(SavableAlgorithm):
     """An SB3 algorithm that learns how the world works without reward, and plans on what it learned.
 
-    ``learn`` explores at random, records transitions and fits a transition model (paper section 3). ``predict`` plans
+    ``learn`` explores, records transitions and fits a transition model (paper section 3). ``predict`` plans
     on the model (section 4) towards the current goal: the environment's own reward, or whatever ``set_reward`` names.
 
     Args:
@@ -64,7 +64,7 @@ class ModelLearningAgent(SavableAlgorithm):
         model: "auto" (at present "graphs": decision graphs found from data), "networks" (predictor and conditioner trained
             by gradient), "paper" (section 3's networks), "tabular", "direct" (see ``forecasts``), another registered name,
             or a TransitionModel.
-        exploration: "auto" or "random"; "persistent" keeps random actions for a while; or an Exploration.
+        exploration: "auto" ("directed" while the states met are few, else "random"), "persistent", or an Exploration.
         gamma: discount of a step when planning.
         num_simulations: simulations for each decision.
         time_budget: seconds for each decision instead (see PlannerSettings), or None.
@@ -273,6 +273,7 @@ class ModelLearningAgent(SavableAlgorithm):
         if fresh_start or self._recorder is None:
             self._recorder = ExperienceRecorder(self.experience.space, self.experience.dataset, self.n_envs)
             self._recorder.reset(self._last_obs)
+            catch_up(self._explorer, self.experience.dataset)
         callbacks.on_training_start(locals(), globals())
         going, iteration = True, 0
         try:
@@ -295,20 +296,19 @@ class ModelLearningAgent(SavableAlgorithm):
 
     def _explore(self, until: int, callback: BaseCallback, recorder: ExperienceRecorder) -> bool:
         """Steps all environments until ``num_timesteps`` reaches ``until``; False if a callback stopped it."""
-        env = cast("VecEnv", self.env)
+        env, watcher = cast("VecEnv", self.env), self._explorer if isinstance(self._explorer, Watching) else None
         callback.on_rollout_start()
         while self.num_timesteps < until:
             assert recorder.states is not None
-            indices = self._explorer.act(self.policy.factored.narrow(recorder.states), self._rng)
+            indices = self._explorer.act(recorder.states, self._rng)
             actions = self.policy.actions.decode(indices)
             new_obs, rewards, dones, infos = env.step(actions)
             self.num_timesteps += env.num_envs
-            if self._vec_normalize_env is not None:
-                new_obs, rewards = (
-                    self._vec_normalize_env.get_original_obs(),
-                    self._vec_normalize_env.get_original_reward(),
-                )
-            recorder.record(indices, new_obs, rewards, dones, infos)
+            if (original := self._vec_normalize_env) is not None:
+                new_obs, rewards = original.get_original_obs(), original.get_original_reward()
+            step = recorder.record(indices, new_obs, rewards, dones, infos)
+            if watcher is not None:
+                watcher.observe(step.states, step.actions, step.next_states, dones)
             self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]  # Tuple spaces too
             self._update_info_buffer(infos, dones)
             self._episode_num += int(dones.sum())

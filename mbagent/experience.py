@@ -95,8 +95,8 @@ class ExperienceRecorder:
         rewards: NDArray[Any],
         dones: NDArray[Any],
         infos: list[dict[str, Any]],
-    ) -> None:
-        """Adds one step of every environment.
+    ) -> TransitionBatch:
+        """Adds one step of every environment, and returns it, [B].
 
         Args:
             actions: int64 [B], numbers of the enumerated actions.
@@ -119,21 +119,21 @@ class ExperienceRecorder:
                 last, _ = as_batch(self._space.space, infos[i]["terminal_observation"])
                 next_states[i] = self._space.encode(last)[0]
                 terminated[i] = not infos[i].get("TimeLimit.truncated", False)
-        self._steps.append(
-            TransitionBatch(
-                self.states,
-                actions.astype(np.int64),
-                next_states,
-                terminated,
-                np.asarray(rewards, dtype=np.float64),
-                self._episodes.copy(),
-            )
+        step = TransitionBatch(
+            self.states,
+            actions.astype(np.int64),
+            next_states,
+            terminated,
+            np.asarray(rewards, dtype=np.float64),
+            self._episodes.copy(),
         )
+        self._steps.append(step)
         self.states = following
         if len(ended):
             self._begin(ended)
         if len(self._steps) >= _FLUSH:
             self.flush()
+        return step
 
     def flush(self) -> None:
         """Hands what was collected to the dataset."""
