@@ -16,6 +16,7 @@ from torch.nn import functional
 
 from mbagent.models.base import hash_rows
 from mbagent.models.networks import Conditioner, Dropout, FactorCodec
+from mbagent.models.pruning import Shrinking
 from mbagent.transitions import TransitionBatch
 
 Loss: TypeAlias = Literal["cross_entropy", "squared"]
@@ -165,17 +166,29 @@ class Trainer:
             logits = logits + base
         return losses(self.codec, logits, batch.outcomes, loss)
 
-    def fit(self, train: Examples, held_out: Examples, generator: torch.Generator, progress: Progress | None) -> float:
-        """Fits the predictor; leaves its best weights in place; returns epochs done."""
-        return self._run(self.predictor, self.predictor_losses, train, held_out, generator, progress)
+    def fit(
+        self,
+        train: Examples,
+        held_out: Examples,
+        generator: torch.Generator,
+        progress: Progress | None,
+        shrinking: Shrinking | None = None,
+    ) -> float:
+        """Fits the predictor; leaves its best weights in place; returns epochs done. ``shrinking`` prunes it on the way."""
+        return self._run(self.predictor, self.predictor_losses, train, held_out, generator, progress, shrinking)
 
     def fit_conditioner(
-        self, train: Examples, held_out: Examples, generator: torch.Generator, progress: Progress | None
+        self,
+        train: Examples,
+        held_out: Examples,
+        generator: torch.Generator,
+        progress: Progress | None,
+        shrinking: Shrinking | None = None,
     ) -> float:
         """Fits the conditioner, if any factor needs it; leaves its best weights in place; returns epochs done."""
         if self.conditioner is None or len(self.conditioner.members) == 0:
             return 0.0
-        return self._run(self.conditioner, self.conditioner_losses, train, held_out, generator, progress)
+        return self._run(self.conditioner, self.conditioner_losses, train, held_out, generator, progress, shrinking)
 
     def observe(self, optimizer: torch.optim.Optimizer, batch: Examples) -> None:
         """One gradient step of both networks at once."""
@@ -215,6 +228,7 @@ class Trainer:
         held_out: Examples,
         generator: torch.Generator,
         progress: Progress | None,
+        shrinking: Shrinking | None,
     ) -> float:
         """AdamW on a one-cycle schedule with early stopping on the held-out loss."""
         config = self.config
@@ -227,9 +241,12 @@ class Trainer:
             _set_rate(optimizer, config.learning_rate * one_cycle(done / n_steps))
             with noise(module, generator):
                 total = row_losses(batch, config.loss).sum(dim=1)
-            _descend(optimizer, (total * batch.weights).mean())
+            loss = (total * batch.weights).mean()
+            _descend(optimizer, loss if shrinking is None else loss + shrinking.penalty())
             done += 1
-            if done % every and done < n_steps:
+            if shrinking is not None:
+                shrinking.after_step(done / n_steps)
+            if (done % every and done < n_steps) or (shrinking is not None and not shrinking.finished):
                 continue
             score = float(self._mean(row_losses, held_out).sum())
             waited += 1
