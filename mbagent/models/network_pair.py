@@ -21,7 +21,10 @@ BodyFactory: TypeAlias = Callable[[FactorCodec, torch.Generator], nn.Module]
 
 
 PRUNED = "pruned"
-"""An array of this name says that weights which are exactly 0 are connections that are gone."""
+"""An array of this name says that weights which are exactly 0 are connections that are gone; see ``tabulate.find_parents``."""
+
+NO_MARKS = np.zeros((0, 0), dtype=np.int8)
+"""Of a model that has no tables."""
 
 
 class NetworkPair(BaseTransitionModel):
@@ -72,7 +75,7 @@ class NetworkPair(BaseTransitionModel):
         if config.conditioner is not None:
             self.conditioner = self._new_conditioner(None, generator)
         self._online: torch.optim.Optimizer | None = None
-        self._pruned = False
+        self._pruned, self._marks = False, NO_MARKS
         self._changed()
         return generator
 
@@ -100,7 +103,7 @@ class NetworkPair(BaseTransitionModel):
             for part, module in self._parts().items()
             for name, tensor in module.state_dict().items()
         }
-        return {**arrays, PRUNED: np.ones(1, dtype=np.bool_)} if self._pruned else arrays
+        return {**arrays, PRUNED: self._marks} if self._pruned else arrays
 
     def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
         """See TransitionModel.
@@ -121,6 +124,7 @@ class NetworkPair(BaseTransitionModel):
             names = module.state_dict()
             module.load_state_dict({n: torch.from_numpy(np.array(state[f"{part}.{n}"])) for n in names})
         self._online, self._pruned = None, PRUNED in state
+        self._marks = np.array(state.get(PRUNED, NO_MARKS), dtype=np.int8)
         self._changed()
 
     def _misfit(self, state: Mapping[str, NDArray[Any]]) -> list[str]:

@@ -21,8 +21,9 @@ from mbagent.models.base import (
     as_keys,
 )
 from mbagent.models.bit_networks import CausalBits, pack_bits
+from mbagent.models.bit_tables import BitTables, sample_tables
 from mbagent.models.kernels import GroupWeights
-from mbagent.models.network_pair import NetworkPair
+from mbagent.models.network_pair import NO_MARKS, NetworkPair
 from mbagent.models.networks import DensePredictor
 from mbagent.models.packing import CompiledBody, as_rows, compiled_body, pack_dense, pack_groups
 from mbagent.models.pruning import PruningConfig, check_fraction
@@ -30,6 +31,7 @@ from mbagent.models.retraining import prune_networks
 from mbagent.models.samplers import log_prob_causal, sample_causal, sample_independent
 from mbagent.models.sweeps import sample_sweeps
 from mbagent.models.systematic import causal_successors, independent_successors
+from mbagent.models.tabulate import Pair, find_parents, tabulate
 from mbagent.models.training import Examples, Trainer, as_examples, examples, one_thread
 from mbagent.transitions import TransitionBatch, TransitionDataset
 
@@ -40,7 +42,8 @@ class NeuralTransitionModel(NetworkPair):
     def _changed(self) -> None:
         self._forward: CompiledBody | None = None
         self._groups: GroupWeights | None = None
-        self._kernel: CausalBits | None = None
+        self._kernel: CausalBits | BitTables | None = None
+        self._tables: BitTables | None = None
 
     @one_thread()
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
@@ -100,8 +103,10 @@ class NeuralTransitionModel(NetworkPair):
         except BaseException:
             self.load_state_dict(before)
             raise
-        self._pruned, self._online = True, None
+        self._pruned, self._online, self._marks = True, None, NO_MARKS
         self._changed()
+        if pair := self._pair():
+            self._marks = find_parents(pair, train)
         return self._report(trainer, rows, (train, held_out), epochs, began)
 
     def _report(
@@ -171,6 +176,9 @@ class NeuralTransitionModel(NetworkPair):
         """See TransitionModel."""
         keys = as_keys(rng, len(states))
         states, actions = as_rows(states, actions, len(self.cardinalities))
+        if (tables := self.tables()) is not None:
+            drawn = sample_tables(states, actions, keys, tables)
+            return np.ascontiguousarray(drawn[:, :-1]), drawn[:, -1] == 1
         logits, probs = self._predict(states, actions)
         config = self.config
         if config.conditioner is None:
@@ -248,11 +256,28 @@ class NeuralTransitionModel(NetworkPair):
             seed,
         )
 
-    def kernel(self) -> CausalBits | None:
-        """The networks for compiled search (see ``compiled_model``); None where ``bit_networks`` does not cover them."""
+    def kernel(self) -> CausalBits | BitTables | None:
+        """The networks, or their tables, for compiled search (see ``compiled_model``); None where neither covers them."""
         if self._kernel is None and self.config.conditioner == "causal" and isinstance(self.predictor, DensePredictor):
-            self._kernel = pack_bits(pack_dense(self.predictor), self._packed_groups(), self._layout, self.config.certain)
+            bits = self.tables()
+            self._kernel = bits if bits is not None else self._pack_bits(self.predictor)
         return self._kernel
+
+    def _pack_bits(self, predictor: DensePredictor) -> CausalBits | None:
+        return pack_bits(pack_dense(predictor), self._packed_groups(), self._layout, self.config.certain)
+
+    def tables(self) -> BitTables | None:
+        """A pruned model's truth tables, which it samples and searches with; None where a variable has too many parents left."""
+        if self._tables is None and len(self._marks) and (pair := self._pair()):
+            self._tables = tabulate(pair, self._marks)
+        return self._tables
+
+    def _pair(self) -> Pair | None:
+        """The networks, where they can become tables: of bits, single actions, and each bit given those before it, at most."""
+        bits = self.codec.all_binary and self.codec.n_steps == 1 and self.config.conditioner != "others"
+        if not bits or not isinstance(self.predictor, DensePredictor):
+            return None
+        return Pair(self.predictor, self.conditioner, self.config.certain)
 
     def _packed_groups(self) -> GroupWeights:
         if self._groups is None:

@@ -239,7 +239,7 @@ class Trainer:
         best, best_weights, waited, done = math.inf, _weights(module), 0, 0
         for batch in batches(train, config.batch_size, n_steps, generator):
             _set_rate(optimizer, config.learning_rate * one_cycle(done / n_steps))
-            with noise(module, generator):
+            with noise(module, generator if shrinking is None else None):  # few paths are left: each has to hold
                 total = row_losses(batch, config.loss).sum(dim=1)
             loss = (total * batch.weights).mean()
             _descend(optimizer, loss if shrinking is None else loss + shrinking.penalty())
@@ -295,8 +295,8 @@ def one_thread() -> Iterator[None]:
 
 
 @contextmanager
-def noise(module: nn.Module, generator: torch.Generator) -> Iterator[None]:
-    """Switches the module's dropout on for a while."""
+def noise(module: nn.Module, generator: torch.Generator | None) -> Iterator[None]:
+    """Switches the module's dropout on for a while, if there is a generator."""
     layers = [layer for layer in module.modules() if isinstance(layer, Dropout)]
     for layer in layers:
         layer.generator = generator
