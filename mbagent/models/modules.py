@@ -90,7 +90,8 @@ def influence(model: NeuralTransitionModel) -> Influence:
 
 
 def _absolute(layer: Affine) -> Floats:
-    return np.abs(layer.weight.detach().numpy()).astype(np.float64)
+    absolute: Floats = np.abs(layer.weight.detach().numpy()).astype(np.float64)
+    return absolute
 
 
 def _conditioner_sums(conditioner: Conditioner) -> Floats:
@@ -100,7 +101,8 @@ def _conditioner_sums(conditioner: Conditioner) -> Floats:
         groups *= conditioner.groups.mask.numpy()
     readout = np.abs(conditioner.readout.detach().numpy()).max(axis=2)
     grouped = groups.reshape(len(readout), conditioner.group_size, -1)
-    return np.einsum("gh,ghc->gc", readout, grouped)
+    sums: Floats = np.einsum("gh,ghc->gc", readout, grouped)
+    return sums
 
 
 def modules(found: Influence) -> list[Module]:
@@ -118,7 +120,7 @@ def dependent_groups(found: Influence) -> list[Module]:
 
 def _modules(found: Influence, links: NDArray[np.bool_]) -> list[Module]:
     """The connected components of more than one variable, or of one that leads to itself."""
-    _, label = connected_components(csr_matrix(links), directed=False)
+    _, label = connected_components(csr_matrix(links.astype(np.int64)), directed=False)
     result = []
     for component in range(label.max() + 1):
         members = np.flatnonzero(label == component)

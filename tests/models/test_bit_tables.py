@@ -45,7 +45,7 @@ def test_tables_survive_saving(pruned: NeuralTransitionModel) -> None:
     first, second = pruned.tables(), other.tables()
     assert first is not None
     assert second is not None
-    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+    assert all(np.array_equal(getattr(first, name), getattr(second, name)) for name in BitTables._fields)
 
 
 def test_compiled_search_imagines_the_same_with_tables(pruned: NeuralTransitionModel) -> None:

@@ -206,7 +206,8 @@ def unseen_play(case: Case, seed: int, n: int = 2000) -> tuple[Any, Any, Any]:
         after = game.transition(obs, actions, derive(seed, np.arange(len(obs)), 8, step))
         rows.append((obs.reshape(len(obs), -1), actions, after.reshape(len(obs), -1)))
         obs = after
-    return tuple(np.concatenate(part).astype(np.int64) for part in zip(*rows, strict=True))
+    states, taken, following = (np.concatenate(part).astype(np.int64) for part in zip(*rows, strict=True))
+    return states, taken, following
 
 
 def excess(case: Case, model: NeuralTransitionModel, states: Any, actions: Any, following: Any) -> float:
