@@ -100,13 +100,13 @@ class NeuralTransitionModel(NetworkPair):
         trainer = Trainer(self.codec, self.predictor, self.conditioner, self.config.training)
         try:
             epochs = prune_networks(trainer, self.connections(), fraction, train, held_out, seed, progress, config)
+            pair = self._pair()
+            marks = find_parents(pair, train) if pair else NO_MARKS
         except BaseException:
             self.load_state_dict(before)
             raise
-        self._pruned, self._online, self._marks = True, None, NO_MARKS
+        self._pruned, self._online, self._marks = True, None, marks
         self._changed()
-        if pair := self._pair():
-            self._marks = find_parents(pair, train)
         return self._report(trainer, rows, (train, held_out), epochs, began)
 
     def _report(
