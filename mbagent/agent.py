@@ -31,9 +31,9 @@ from mbagent.learned_reward import LearnedReward
 from mbagent.models.base import FitReport, TransitionModel
 from mbagent.models.factory import build_model
 from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
+from mbagent.pruned import PrunableAlgorithm
 from mbagent.reporting import fit_progress, log_fit, log_rollout
 from mbagent.rewards import RewardFn
-from mbagent.saving import SavableAlgorithm
 from mbagent.spaces import ActionEnumeration, FactoredSpace
 from mbagent.transitions import TransitionDataset
 from mbagent.wrapping import wrap_env
@@ -48,7 +48,7 @@ MAX_START_STATES = 512
 """Start states kept for generating the reachable machine."""
 
 
-class ModelLearningAgent(SavableAlgorithm):
+class ModelLearningAgent(PrunableAlgorithm):
     """An SB3 algorithm that learns how the world works without reward, and plans on what it learned.
 
     ``learn`` explores, records transitions and fits a transition model (paper section 3). ``predict`` plans

@@ -87,7 +87,17 @@ def _chance(logit: float) -> float:
 
 
 @inlined
-def _split(
+def settled_chance(one: float) -> float:
+    """Probability ``one`` of a bit, pruned as ``particles.prune`` does."""
+    if one < NEGLIGIBLE * (1.0 - one):
+        return 0.0
+    if 1.0 - one < NEGLIGIBLE * one:
+        return 1.0
+    return one
+
+
+@inlined
+def split_bit(
     q: int,
     n_live: int,
     bit: int,
@@ -150,7 +160,7 @@ def _settle(logits: Floats32, group_of: Ints, certain: float, base: Ints, still_
 
 
 @inlined
-def _write(total: int, n_live: int, base: Ints, still_open: Ints, p: Particles, n_grid: int, out: Outcomes) -> None:
+def write_outcomes(total: int, n_live: int, base: Ints, still_open: Ints, p: Particles, n_grid: int, out: Outcomes) -> None:
     """Writes the outcomes of an action from number ``total`` on, with their probabilities."""
     out_states, ended, probabilities = out.states, out.terminated, out.probabilities
     n_factors, found, mass, points, factors = len(base) - 1, 0.0, p.mass, p.points, p.factors
@@ -199,8 +209,8 @@ def bits_outcomes(k: CausalBits, work: BitsWork, state: Ints, n_grid: int, key: 
             for q in range(n_live):
                 if not trusted:
                     logit = condition(q, w, g, prior, still_open, others, readout, offsets, k.activation, known, group, factors)
-                n_live = _split(q, n_live, i, w, _chance(logit), grid, first_point, points, low, high, mass, factors)
-        _write(total, n_live, base, still_open[:n_open], p, n_grid, out)
+                n_live = split_bit(q, n_live, i, w, _chance(logit), grid, first_point, points, low, high, mass, factors)
+        write_outcomes(total, n_live, base, still_open[:n_open], p, n_grid, out)
         out.counts[action] = n_live
         total += n_live
     return total

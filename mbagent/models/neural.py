@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from typing import Any, TypeAlias
+from collections.abc import Callable
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
-from torch import nn
 
 from mbagent.models import causal_bits as causal_bits  # its overloads
 from mbagent.models.arithmetic import Floats32, probabilities
 from mbagent.models.base import (
-    LARGEST_NUMBER,
     Actions,
-    BaseTransitionModel,
     Bools,
     FitReport,
     Floats,
@@ -26,89 +21,29 @@ from mbagent.models.base import (
     as_keys,
 )
 from mbagent.models.bit_networks import CausalBits, pack_bits
-from mbagent.models.config import NeuralConfig
+from mbagent.models.bit_tables import BitTables, sample_tables
 from mbagent.models.kernels import GroupWeights
-from mbagent.models.networks import Conditioner, DensePredictor, FactorCodec
-from mbagent.models.packing import CompiledBody, compiled_body, pack_dense, pack_groups, pack_layout
+from mbagent.models.network_pair import NO_MARKS, NetworkPair
+from mbagent.models.networks import DensePredictor
+from mbagent.models.packing import CompiledBody, as_rows, compiled_body, pack_dense, pack_groups
+from mbagent.models.pruning import PruningConfig, check_fraction
+from mbagent.models.retraining import prune_networks
 from mbagent.models.samplers import log_prob_causal, sample_causal, sample_independent
 from mbagent.models.sweeps import sample_sweeps
 from mbagent.models.systematic import causal_successors, independent_successors
+from mbagent.models.tabulate import Pair, find_parents, tabulate
 from mbagent.models.training import Examples, Trainer, as_examples, examples, one_thread
-from mbagent.transitions import TransitionDataset
-
-BodyFactory: TypeAlias = Callable[[FactorCodec, torch.Generator], nn.Module]
-"""Builds a predictor body (see ``networks.Predictor``); all its first weights must come from the generator."""
+from mbagent.transitions import TransitionBatch, TransitionDataset
 
 
-class NeuralTransitionModel(BaseTransitionModel):
-    """A predictor network, alone or with a conditioner network.
-
-    Args:
-        cardinalities: number of values of each state factor, length F.
-        n_actions: number of enumerated actions A of a single step.
-        config: see NeuralConfig.
-        body: builds another predictor body than the dense one.
-        n_steps: actions in the string that is an action of this model (paper 4.2); see ``FactorCodec``.
-        seed: of the first weights; ``fit`` starts from its own seed's.
-    """
-
-    def __init__(
-        self,
-        cardinalities: tuple[int, ...],
-        n_actions: int,
-        config: NeuralConfig | None = None,
-        *,
-        body: BodyFactory | None = None,
-        n_steps: int = 1,
-        seed: int = 0,
-    ) -> None:
-        if n_steps < 1 or n_actions**n_steps > LARGEST_NUMBER:
-            raise ValueError(
-                f"A model's action is a string of 1 or more actions, at most {LARGEST_NUMBER:.0e} strings in all; "
-                f"got n_steps = {n_steps} with {n_actions} actions."
-            )
-        super().__init__(cardinalities, n_actions**n_steps)
-        self.config = config or NeuralConfig()
-        self.codec = FactorCodec(self.cardinalities, n_actions, n_steps)
-        self._body = body
-        self._layout = pack_layout(self.codec)
-        self._dropout = self.config.dropout_for(len(self.cardinalities))
-        self._build(seed)
-
-    def _build(self, seed: int) -> torch.Generator:
-        """New networks; returns the generator that their weights came from."""
-        config, generator = self.config, torch.Generator().manual_seed(seed)
-        self.predictor: nn.Module
-        if self._body is not None:
-            self.predictor = self._body(self.codec, generator)
-        else:
-            shape = (config.hidden, config.activation, config.residual, self._dropout)
-            self.predictor = DensePredictor(self.codec, *shape, generator=generator)
-        self.conditioner: Conditioner | None = None
-        if config.conditioner is not None:
-            self.conditioner = self._new_conditioner(None, generator)
-        self._online: torch.optim.Optimizer | None = None
-        self._changed()
-        return generator
-
-    def _new_conditioner(self, grouped: torch.Tensor | None, generator: torch.Generator) -> Conditioner:
-        config = self.config
-        assert config.conditioner is not None
-        return Conditioner(
-            self.codec,
-            config.conditioner,
-            config.group_size,
-            config.activation,
-            config.correction,
-            self._dropout,
-            grouped,
-            generator=generator,
-        )
+class NeuralTransitionModel(NetworkPair):
+    """A predictor network, alone or with a conditioner network. Arguments are those of NetworkPair."""
 
     def _changed(self) -> None:
         self._forward: CompiledBody | None = None
         self._groups: GroupWeights | None = None
-        self._kernel: CausalBits | None = None
+        self._kernel: CausalBits | BitTables | None = None
+        self._tables: BitTables | None = None
 
     @one_thread()
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
@@ -132,18 +67,71 @@ class NeuralTransitionModel(BaseTransitionModel):
             half = None if progress is None else lambda share: progress(0.5 + 0.5 * share)
             epochs += trainer.fit_conditioner(train, held_out, generator, half)
         self._changed()
-        first, second = trainer.evaluate(held_out)
+        return self._report(trainer, (train_rows, held_out_rows), (train, held_out), epochs, began)
+
+    @one_thread()
+    def prune(
+        self,
+        data: TransitionDataset,
+        fraction: float,
+        *,
+        seed: int = 0,
+        progress: Callable[[float], None] | None = None,
+        config: PruningConfig | None = None,
+    ) -> FitReport:
+        """Removes the smallest weights of both networks and trains what is left (paper section 5); see ``pruning``.
+
+        Args:
+            data: what the model was fitted to; the same ``seed`` holds out the same rows.
+            fraction: share of the connections of each network that are gone afterwards, in [0, 1). What is gone stays gone when
+                the model is pruned again; ``fit`` begins anew with all connections.
+            seed: of the rows held out and of the batches.
+            progress: is told the share done, 0 ... 1.
+            config: see PruningConfig.
+
+        Raises:
+            ValueError: a fraction outside [0, 1), or no data; the model is as it was then, as after any other error.
+        """
+        fraction, began, before = check_fraction(fraction), time.perf_counter(), self.state_dict()
+        if not len(data):
+            raise ValueError("There are no transitions to train what is left on: hand over those that the model was fitted to.")
+        rows = data.split(self.config.training.validation, seed)
+        train, held_out = examples(rows[0]), examples(rows[1])
+        trainer = Trainer(self.codec, self.predictor, self.conditioner, self.config.training)
+        try:
+            epochs = prune_networks(trainer, self.connections(), fraction, train, held_out, seed, progress, config)
+            pair = self._pair()
+            marks = find_parents(pair, train) if pair else NO_MARKS
+        except BaseException:
+            self.load_state_dict(before)
+            raise
+        self._pruned, self._online, self._marks = True, None, marks
+        self._changed()
+        return self._report(trainer, rows, (train, held_out), epochs, began)
+
+    def _report(
+        self,
+        trainer: Trainer,
+        rows: tuple[TransitionBatch, TransitionBatch],
+        distinct: tuple[Examples, Examples],
+        epochs: float,
+        began: float,
+    ) -> FitReport:
+        first, second = trainer.evaluate(distinct[1])
+        connections = self.connections().values()
         return FitReport(
-            n_train=len(train_rows),
-            n_validation=len(held_out_rows),
+            n_train=len(rows[0]),
+            n_validation=len(rows[1]),
             epochs=round(epochs),
             seconds=time.perf_counter() - began,
             predictor_loss=first,
             conditioner_loss=second,
-            exact_match=self._exact_match(held_out),
+            exact_match=self._exact_match(distinct[1]),
             log={
-                "distinct_transitions": float(len(train)),
+                "distinct_transitions": float(len(distinct[0])),
                 "conditioned_factors": float(len(self.conditioner.members)) if self.conditioner else 0.0,
+                "connections": float(sum(c.left for c in connections)),
+                "pruned": 1.0 - sum(c.left for c in connections) / max(1, sum(c.total for c in connections)),
             },
         )
 
@@ -178,13 +166,19 @@ class NeuralTransitionModel(BaseTransitionModel):
         if self._online is None:
             parameters = [p for module in self._parts().values() for p in module.parameters()]
             self._online = torch.optim.Adam(parameters, lr=self.config.training.online_learning_rate)
+            self._left = self.connections()
         trainer.observe(self._online, as_examples(states, actions, next_states, terminated))
+        for connections in self._left.values() if self._pruned else ():
+            connections.apply()
         self._changed()
 
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
         """See TransitionModel."""
         keys = as_keys(rng, len(states))
-        states, actions = _rows(states, actions, len(self.cardinalities))
+        states, actions = as_rows(states, actions, len(self.cardinalities))
+        if (tables := self.tables()) is not None:
+            drawn = sample_tables(states, actions, keys, tables)
+            return np.ascontiguousarray(drawn[:, :-1]), drawn[:, -1] == 1
         logits, probs = self._predict(states, actions)
         config = self.config
         if config.conditioner is None:
@@ -224,7 +218,7 @@ class NeuralTransitionModel(BaseTransitionModel):
 
     def probabilities(self, states: States, actions: Actions) -> Floats:
         """The predictor's output for every factor, ``terminated`` last: float64 [B, O, K], 0 where a factor lacks a value."""
-        return self._predict(*_rows(states, actions, len(self.cardinalities)))[1]
+        return self._predict(*as_rows(states, actions, len(self.cardinalities)))[1]
 
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
         """See TransitionModel; exact for the distribution that ``sample`` draws from."""
@@ -233,7 +227,7 @@ class NeuralTransitionModel(BaseTransitionModel):
                 'A conditioner with mask "others" samples by sweeps and has no exact probabilities; '
                 'use NeuralConfig(conditioner="causal").'
             )
-        states, actions = _rows(states, actions, len(self.cardinalities))
+        states, actions = as_rows(states, actions, len(self.cardinalities))
         outcomes = np.concatenate([next_states, terminated[:, None]], axis=1).astype(np.int64)
         logits, probs = self._predict(states, actions)
         if self.config.conditioner is None:
@@ -246,7 +240,7 @@ class NeuralTransitionModel(BaseTransitionModel):
         """See TransitionModel; systematic draws where probabilities are exact (``systematic.py``), else plain draws."""
         if self.config.conditioner == "others":
             return super().successors(states, actions, n_samples, seed)
-        states, actions = _rows(states, actions, len(self.cardinalities))
+        states, actions = as_rows(states, actions, len(self.cardinalities))
         logits, probs = self._predict(states, actions)
         if self.config.conditioner is None:
             return independent_successors(probs, self._layout.outputs, n_samples, seed)
@@ -262,57 +256,28 @@ class NeuralTransitionModel(BaseTransitionModel):
             seed,
         )
 
-    def kernel(self) -> CausalBits | None:
-        """The networks for compiled search (see ``compiled_model``); None where ``bit_networks`` does not cover them."""
+    def kernel(self) -> CausalBits | BitTables | None:
+        """The networks, or their tables, for compiled search (see ``compiled_model``); None where neither covers them."""
         if self._kernel is None and self.config.conditioner == "causal" and isinstance(self.predictor, DensePredictor):
-            self._kernel = pack_bits(pack_dense(self.predictor), self._packed_groups(), self._layout, self.config.certain)
+            bits = self.tables()
+            self._kernel = bits if bits is not None else self._pack_bits(self.predictor)
         return self._kernel
 
-    def state_dict(self) -> dict[str, NDArray[Any]]:
-        """See TransitionModel."""
-        return {
-            f"{part}.{name}": tensor.detach().numpy().copy()
-            for part, module in self._parts().items()
-            for name, tensor in module.state_dict().items()
-        }
+    def _pack_bits(self, predictor: DensePredictor) -> CausalBits | None:
+        return pack_bits(pack_dense(predictor), self._packed_groups(), self._layout, self.config.certain)
 
-    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """See TransitionModel.
+    def tables(self) -> BitTables | None:
+        """A pruned model's truth tables, which it samples and searches with; None where a variable has too many parents left."""
+        if self._tables is None and len(self._marks) and (pair := self._pair()):
+            self._tables = tabulate(pair, self._marks)
+        return self._tables
 
-        Raises:
-            ValueError: the arrays are not those of a model of this shape; nothing is changed then.
-        """
-        wrong = self._misfit(state)
-        if wrong:
-            raise ValueError(
-                f"These weights do not fit this model (first difference: {wrong[0]!r}); "
-                "build the model with the configuration that the weights were saved from."
-            )
-        if self.conditioner is not None:
-            grouped = torch.from_numpy(np.array(state["conditioner.grouped"], dtype=np.bool_))
-            self.conditioner = self._new_conditioner(grouped, torch.Generator())
-        for part, module in self._parts().items():
-            names = module.state_dict()
-            module.load_state_dict({n: torch.from_numpy(np.array(state[f"{part}.{n}"])) for n in names})
-        self._online = None
-        self._changed()
-
-    def _misfit(self, state: Mapping[str, NDArray[Any]]) -> list[str]:
-        """Names of arrays that are missing, unknown, or of the wrong shape (the conditioner's first axis is free)."""
-        own = self.state_dict()
-        wrong = sorted(set(own) ^ set(state))
-        for name in own if not wrong else ():
-            shape, given = own[name].shape, np.shape(state[name])
-            free = name.startswith("conditioner.") and name != "conditioner.grouped"
-            if shape[free:] != given[free:] or len(shape) != len(given):
-                wrong.append(name)
-        return wrong
-
-    def _parts(self) -> dict[str, nn.Module]:
-        parts = {"predictor": self.predictor}
-        if self.conditioner is not None:
-            parts["conditioner"] = self.conditioner
-        return parts
+    def _pair(self) -> Pair | None:
+        """The networks, where they can become tables: of bits, single actions, and each bit given those before it, at most."""
+        bits = self.codec.all_binary and self.codec.n_steps == 1 and self.config.conditioner != "others"
+        if not bits or not isinstance(self.predictor, DensePredictor):
+            return None
+        return Pair(self.predictor, self.conditioner, self.config.certain)
 
     def _packed_groups(self) -> GroupWeights:
         if self._groups is None:
@@ -326,14 +291,3 @@ class NeuralTransitionModel(BaseTransitionModel):
             self._forward = compiled_body(self.predictor, self._layout)
         logits = self._forward(states, actions)
         return logits, probabilities(logits, self._layout.outputs)
-
-
-def _rows(states: States, actions: Actions, n_factors: int) -> tuple[States, Actions]:
-    """Both as contiguous int64, the one form that the compiled kernels take, which look at no shape."""
-    states, actions = np.ascontiguousarray(states, dtype=np.int64), np.ascontiguousarray(actions, dtype=np.int64)
-    if states.ndim != 2 or states.shape[1] != n_factors or actions.shape != (len(states),):
-        raise ValueError(
-            f"A model of {n_factors} factors needs states [B, {n_factors}] and actions [B], "
-            f"got shapes {states.shape} and {actions.shape}."
-        )
-    return states, actions

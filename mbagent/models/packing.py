@@ -136,3 +136,14 @@ def _array(tensor: Tensor) -> Floats32:
     with torch.no_grad():
         array: Floats32 = np.array(tensor.detach().numpy(), dtype=np.float32)
     return array
+
+
+def as_rows(states: States, actions: Actions, n_factors: int) -> tuple[States, Actions]:
+    """Both as contiguous int64, the one form that the compiled kernels take, which look at no shape."""
+    states, actions = np.ascontiguousarray(states, dtype=np.int64), np.ascontiguousarray(actions, dtype=np.int64)
+    if states.ndim != 2 or states.shape[1] != n_factors or actions.shape != (len(states),):
+        raise ValueError(
+            f"A model of {n_factors} factors needs states [B, {n_factors}] and actions [B], "
+            f"got shapes {states.shape} and {actions.shape}."
+        )
+    return states, actions

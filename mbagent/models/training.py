@@ -16,6 +16,7 @@ from torch.nn import functional
 
 from mbagent.models.base import hash_rows
 from mbagent.models.networks import Conditioner, Dropout, FactorCodec
+from mbagent.models.pruning import Shrinking
 from mbagent.transitions import TransitionBatch
 
 Loss: TypeAlias = Literal["cross_entropy", "squared"]
@@ -165,17 +166,29 @@ class Trainer:
             logits = logits + base
         return losses(self.codec, logits, batch.outcomes, loss)
 
-    def fit(self, train: Examples, held_out: Examples, generator: torch.Generator, progress: Progress | None) -> float:
-        """Fits the predictor; leaves its best weights in place; returns epochs done."""
-        return self._run(self.predictor, self.predictor_losses, train, held_out, generator, progress)
+    def fit(
+        self,
+        train: Examples,
+        held_out: Examples,
+        generator: torch.Generator,
+        progress: Progress | None,
+        shrinking: Shrinking | None = None,
+    ) -> float:
+        """Fits the predictor; leaves its best weights in place; returns epochs done. ``shrinking`` prunes it on the way."""
+        return self._run(self.predictor, self.predictor_losses, train, held_out, generator, progress, shrinking)
 
     def fit_conditioner(
-        self, train: Examples, held_out: Examples, generator: torch.Generator, progress: Progress | None
+        self,
+        train: Examples,
+        held_out: Examples,
+        generator: torch.Generator,
+        progress: Progress | None,
+        shrinking: Shrinking | None = None,
     ) -> float:
         """Fits the conditioner, if any factor needs it; leaves its best weights in place; returns epochs done."""
         if self.conditioner is None or len(self.conditioner.members) == 0:
             return 0.0
-        return self._run(self.conditioner, self.conditioner_losses, train, held_out, generator, progress)
+        return self._run(self.conditioner, self.conditioner_losses, train, held_out, generator, progress, shrinking)
 
     def observe(self, optimizer: torch.optim.Optimizer, batch: Examples) -> None:
         """One gradient step of both networks at once."""
@@ -215,6 +228,7 @@ class Trainer:
         held_out: Examples,
         generator: torch.Generator,
         progress: Progress | None,
+        shrinking: Shrinking | None,
     ) -> float:
         """AdamW on a one-cycle schedule with early stopping on the held-out loss."""
         config = self.config
@@ -225,11 +239,14 @@ class Trainer:
         best, best_weights, waited, done = math.inf, _weights(module), 0, 0
         for batch in batches(train, config.batch_size, n_steps, generator):
             _set_rate(optimizer, config.learning_rate * one_cycle(done / n_steps))
-            with noise(module, generator):
+            with noise(module, generator if shrinking is None else None):  # few paths are left: each has to hold
                 total = row_losses(batch, config.loss).sum(dim=1)
-            _descend(optimizer, (total * batch.weights).mean())
+            loss = (total * batch.weights).mean()
+            _descend(optimizer, loss if shrinking is None else loss + shrinking.penalty())
             done += 1
-            if done % every and done < n_steps:
+            if shrinking is not None:
+                shrinking.after_step(done / n_steps)
+            if (done % every and done < n_steps) or (shrinking is not None and not shrinking.finished):
                 continue
             score = float(self._mean(row_losses, held_out).sum())
             waited += 1
@@ -278,8 +295,8 @@ def one_thread() -> Iterator[None]:
 
 
 @contextmanager
-def noise(module: nn.Module, generator: torch.Generator) -> Iterator[None]:
-    """Switches the module's dropout on for a while."""
+def noise(module: nn.Module, generator: torch.Generator | None) -> Iterator[None]:
+    """Switches the module's dropout on for a while, if there is a generator."""
     layers = [layer for layer in module.modules() if isinstance(layer, Dropout)]
     for layer in layers:
         layer.generator = generator

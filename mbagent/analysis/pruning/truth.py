@@ -1,0 +1,57 @@
+"""Which variables of a game really hang on which: what the connections that are left are compared with."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.modules import Influence
+from mbagent_envs.flier_catcher import FlierCatcher
+from mbagent_envs.game import Game
+
+Bools = NDArray[np.bool_]
+
+
+class Agreement(NamedTuple):
+    """See ``experiment.Row``."""
+
+    parents: float
+    precision: float
+    recall: float
+    conditions_precision: float
+    conditions_recall: float
+
+
+def agreement(game: Game, found: Influence) -> Agreement:
+    """Of the connections that are left with the true dependencies."""
+    parents, nan = float((found.states[:-1] > 0.0).sum(axis=1).mean()), float("nan")
+    if not isinstance(game, FlierCatcher):
+        return Agreement(parents, nan, nan, nan, nan)
+    states, others = flier_catcher_dependencies(game)
+    linked = found.others[:-1, :-1] > 0.0
+    return Agreement(parents, *_rates(found.states[:-1] > 0.0, states), *_rates(np.tril(linked | linked.T, -1), others))
+
+
+def _rates(found: Bools, true: Bools) -> tuple[float, float]:
+    both = (found & true).sum()
+    return float(both / max(found.sum(), 1)), float(both / true.sum())
+
+
+def flier_catcher_dependencies(game: FlierCatcher) -> tuple[Bools, Bools]:
+    """(from state to next state, bool [F, F]; between next variables, the later first, bool [F, F]).
+
+    A player's row hangs on the rows beside it and on itself; a cell with a flier on the one to its right; new fliers on nothing
+    but each other: at most one comes in a step.
+    """
+    shape = game.observation_space.shape
+    number: NDArray[Any] = np.arange(int(np.prod(shape))).reshape(shape)
+    states = np.zeros((number.size, number.size), dtype=np.bool_)
+    others = np.zeros_like(states)
+    for row in range(game.height):
+        for beside in range(max(row - 1, 0), min(row + 2, game.height)):
+            states[number[0, row, 0], number[0, beside, 0]] = game.stay or beside != row or row in (0, game.height - 1)
+        states[number[1, row, :-1], number[1, row, 1:]] = True
+        others[number[1, row, -1], number[1, :row, -1]] = True
+    return states, others

@@ -1,0 +1,128 @@
+"""Pruning (paper section 5): the smallest weights go, a few at a time, while what is left is trained on.
+
+The paper prunes once and retrains; going gradually, as here by default, loses less (Zhu and Gupta 2017, "To prune, or not to
+prune", whose schedule this is). A weight that is gone is exactly 0 and stays so.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+
+def check_fraction(fraction: float) -> float:
+    """The fraction as a float.
+
+    Raises:
+        ValueError: it is not a number in [0, 1).
+    """
+    if isinstance(fraction, bool) or not isinstance(fraction, int | float) or not 0.0 <= fraction < 1.0:
+        raise ValueError(
+            f"fraction is the share of connections to remove, a number from 0 up to but not including 1, got {fraction!r}."
+        )
+    return float(fraction)
+
+
+@dataclass(frozen=True)
+class PruningConfig:
+    """How a network is pruned.
+
+    Attributes:
+        gradual: whether connections go a few at a time while training; False: all at once, then training (the paper).
+        removal: share of the training during which connections go.
+        steps: how often some go in that time.
+        shrink: how strongly all weights are drawn to 0 in that time, so that what is of no use becomes small (the weight of the
+            sum of absolute values in the loss); nothing draws afterwards.
+    """
+
+    gradual: bool = True
+    removal: float = 0.6
+    steps: int = 50
+    shrink: float = 1e-3
+
+
+class Connections:
+    """The weights of a network that stand for connections, and which of them are left.
+
+    Args:
+        module: the network; its biases are no connections, nor is what its own masks never let through.
+        zeros_gone: whether weights that are exactly 0 are connections that are gone.
+    """
+
+    def __init__(self, module: nn.Module, zeros_gone: bool = False) -> None:
+        self.weights = {name: p for name, p in module.named_parameters() if not name.endswith(("bias", "offset"))}
+        self.possible = {name: _possible(module, name, p) for name, p in self.weights.items()}
+        self.kept = dict(self.possible)
+        if zeros_gone:
+            self.kept = {name: self.possible[name] & (p.detach() != 0.0) for name, p in self.weights.items()}
+        self.total = sum(int(mask.sum()) for mask in self.possible.values())
+
+    @property
+    def left(self) -> int:
+        """How many are left."""
+        return sum(int(mask.sum()) for mask in self.kept.values())
+
+    @torch.no_grad()
+    def drop(self, fraction: float) -> None:
+        """Removes the smallest weights by absolute value until this share of all is gone; those gone before stay gone."""
+        stay = self.total - round(fraction * self.total)
+        sizes = torch.cat([p.abs()[self.kept[name]] for name, p in self.weights.items()])
+        if len(sizes) <= stay or stay < 1:
+            return
+        limit = torch.kthvalue(sizes, len(sizes) - stay).values
+        self.kept = {name: self.kept[name] & (p.abs() > limit) for name, p in self.weights.items()}
+        self.apply()
+
+    @torch.no_grad()
+    def apply(self) -> None:
+        """Sets the weights of all connections that are gone to 0."""
+        for name, p in self.weights.items():
+            p.mul_(self.kept[name])
+
+
+class Shrinking:
+    """What ``Trainer`` does to a network's connections while it trains.
+
+    Args:
+        connections: of the network.
+        fraction: the share that is to be gone in the end.
+        config: see PruningConfig.
+    """
+
+    def __init__(self, connections: Connections, fraction: float, config: PruningConfig) -> None:
+        self.connections, self.config = connections, config
+        self._begun = 1.0 - connections.left / max(connections.total, 1)
+        self.fraction = max(fraction, self._begun)  # what is gone stays gone
+        self._done = 0
+        if not config.gradual:
+            connections.drop(fraction)
+
+    @property
+    def finished(self) -> bool:
+        """Whether all that is to go is gone."""
+        return not self.config.gradual or self._done >= self.config.steps
+
+    def penalty(self) -> Tensor | float:
+        """What is added to the loss."""
+        if self.finished or self.config.shrink == 0.0:
+            return 0.0
+        return self.config.shrink * torch.stack([p.abs().sum() for p in self.connections.weights.values()]).sum()
+
+    def after_step(self, share: float) -> None:
+        """Called after a gradient step, ``share`` of the training done."""
+        due = math.floor(self.config.steps * min(share / self.config.removal, 1.0))
+        if self.config.gradual and due > self._done:
+            self._done = due
+            left = (1.0 - due / self.config.steps) ** 3
+            self.connections.drop(self.fraction + (self._begun - self.fraction) * left)
+        self.connections.apply()
+
+
+def _possible(module: nn.Module, name: str, weight: nn.Parameter) -> Tensor:
+    """Which of a weight's numbers the module's own mask lets through, bool."""
+    owner = module.get_submodule(name.rpartition(".")[0])
+    mask = getattr(owner, "mask", None)
+    return torch.ones_like(weight, dtype=torch.bool) if mask is None else mask.clone()

@@ -1,0 +1,155 @@
+"""From a pruned predictor and causal conditioner of bits to truth tables (see ``bit_tables.py``).
+
+What a bit hangs on is what a path of connections leads from and what makes a difference: a bit that always has the same value,
+or whose paths are too weak to matter, is taken for its usual value. How much that changes is measured on transitions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mbagent.models.bit_tables import BitTables
+from mbagent.models.networks import ACTIVATIONS, Affine, Conditioner, DensePredictor
+from mbagent.models.training import Examples
+
+MOST_PARENTS = 12
+"""A table has at most two to this power of entries for each action."""
+
+TOLERANCE = 0.002
+"""What taking bits for their usual values may change in all, in total variation summed over variables."""
+
+PARENT = 2
+"""Marks a bit that matters; 0 and 1 are values that a bit is taken for."""
+
+ROWS = 1024
+"""Transitions that differences are measured on, at most."""
+
+Marks = NDArray[np.int8]
+
+
+class Pair(NamedTuple):
+    """The two networks and from which probability on the predictor is trusted."""
+
+    predictor: DensePredictor
+    conditioner: Conditioner | None
+    certain: float
+
+
+def _predicted(pair: Pair, inputs: Tensor, outputs: slice) -> Tensor:
+    """The predictor's logits of some outcome bits, from columns [N, n_inputs]."""
+    predictor, values = pair.predictor, inputs
+    for layer in predictor.layers:
+        values = ACTIVATIONS[predictor.activation](layer(values))
+    logits = values @ predictor.out.weight[outputs].T + predictor.out.bias[outputs]
+    if predictor.stay is not None:
+        n = predictor.codec.n_state_columns
+        signed = (2.0 * inputs[:, :n] - 1.0) * (inputs[:, n:] @ predictor.stay)
+        logits = logits + torch.cat((signed, signed.new_zeros(len(signed), 1)), dim=1)[:, outputs]
+    return logits
+
+
+def chances(pair: Pair, columns: Tensor, i: int) -> Tensor:
+    """P(bit i = 1) [N] from columns of state, action and outcome [N, n_inputs + O], as ``samplers.sample_causal`` has it."""
+    n_inputs, conditioner = pair.predictor.codec.n_inputs, pair.conditioner
+    logit = _predicted(pair, columns[:, :n_inputs], slice(i, i + 1))[:, 0]
+    chance = torch.sigmoid(logit.double())
+    if conditioner is None or not bool(conditioner.grouped[i]):
+        return chance
+    g, size = int(conditioner.grouped[:i].sum()), conditioner.group_size
+    groups, rows = conditioner.groups, slice(g * size, (g + 1) * size)
+    weight = groups.weight[rows] if groups.mask is None else groups.weight[rows] * groups.mask[rows]
+    hidden = ACTIVATIONS[conditioner.activation](columns @ weight.T + groups.bias[rows])
+    own = (hidden @ conditioner.readout[g] + conditioner.offset[g])[:, 0]
+    asked = torch.sigmoid((own + logit if conditioner.correction else own).double())
+    return torch.where(torch.maximum(chance, 1.0 - chance) >= pair.certain, chance, asked)
+
+
+def _paths(layers: list[Tensor]) -> NDArray[np.bool_]:
+    """Which inputs [outputs, inputs] a path leads from, through weights [to, from]."""
+    reach = (layers[0] != 0.0).double()
+    for weight in layers[1:]:
+        reach = ((weight != 0.0).double() @ reach > 0.0).double()
+    found: NDArray[np.bool_] = reach.numpy() > 0.0
+    return found
+
+
+def paths(pair: Pair) -> NDArray[np.bool_]:
+    """Which columns of state, action and outcome a path leads from to each outcome bit, bool [O, n_inputs + O]."""
+    predictor, conditioner, codec = pair.predictor, pair.conditioner, pair.predictor.codec
+    n_outputs, n_inputs = len(codec.outputs), codec.n_inputs
+    reach = np.zeros((n_outputs, n_inputs + n_outputs), dtype=np.bool_)
+    layers = [layer.weight.detach() for layer in (*predictor.layers, predictor.out) if isinstance(layer, Affine)]
+    reach[:, :n_inputs] = _paths(layers)
+    if predictor.stay is not None:
+        left = predictor.stay.detach().numpy() != 0.0
+        bits = np.arange(codec.n_state_columns)
+        reach[bits, bits] |= left.any(axis=0)
+        reach[bits, codec.n_state_columns : n_inputs] |= left.T
+    if conditioner is not None:
+        weight = conditioner.groups.weight.detach()
+        weight = weight if conditioner.groups.mask is None else weight * conditioner.groups.mask
+        read = (conditioner.readout.detach() != 0.0).any(dim=2).double()
+        grouped = (weight != 0.0).double().view(len(read), conditioner.group_size, -1)
+        reach[conditioner.members.numpy()] |= torch.einsum("gh,ghc->gc", read, grouped).numpy() > 0.0
+    return reach
+
+
+@torch.no_grad()
+def find_parents(pair: Pair, rows: Examples) -> Marks:
+    """What each outcome bit hangs on: int8 [O, F + O], PARENT or the value that a bit is taken for; of state and outcome."""
+    codec = pair.predictor.codec
+    rows = rows.select(torch.arange(min(ROWS, len(rows))))
+    columns = torch.cat((codec.inputs(rows.states, rows.actions), codec.targets(rows.outcomes)), dim=1)
+    usual = (columns.mean(dim=0) > 0.5).float()
+    reach, n_bits = paths(pair), codec.n_state_columns
+    bits = np.concatenate([np.arange(n_bits), np.arange(codec.n_inputs, columns.shape[1])])
+    marks = np.tile(usual.numpy().astype(np.int8)[bits], (len(reach), 1))
+    differs = [torch.nonzero(columns[:, j] != usual[j])[:, 0] for j in range(columns.shape[1])]
+    for i in range(len(reach)):
+        known, matter = chances(pair, columns, i), np.zeros(len(bits))
+        for place in np.flatnonzero(reach[i, bits]):
+            j = bits[place]
+            if len(differs[j]):
+                changed = columns[differs[j]]
+                changed[:, j] = usual[j]
+                matter[place] = float((chances(pair, changed, i) - known[differs[j]]).abs().sum()) / len(columns)
+        order = np.argsort(matter)
+        needed = np.cumsum(matter[order]) > TOLERANCE / len(reach)
+        marks[i, order[needed]] = PARENT
+    return marks
+
+
+@torch.no_grad()
+def tabulate(pair: Pair, marks: Marks) -> BitTables | None:
+    """Tables over what ``marks`` names; None where a bit has more than MOST_PARENTS parents."""
+    codec, reach = pair.predictor.codec, paths(pair)
+    n_bits, n_actions, n_outputs = codec.n_state_columns, codec.n_actions, len(codec.outputs)
+    if (marks == PARENT).sum(axis=1).max() > MOST_PARENTS:
+        return None
+    tables, begin, stride, n_states, parents, first = [], [0], [], [], [], [0]
+    for i in range(n_outputs):
+        mine = np.flatnonzero(marks[i] == PARENT)
+        size, acts = 1 << len(mine), bool(reach[i, n_bits : codec.n_inputs].any())
+        fixed = torch.from_numpy(np.where(marks[i] == PARENT, 0, marks[i]).astype(np.float32))
+        columns = torch.zeros(size * n_actions if acts else size, codec.n_inputs + n_outputs)
+        columns[:, :n_bits], columns[:, codec.n_inputs :] = fixed[:n_bits], fixed[n_bits:]
+        number = torch.arange(len(columns))
+        for power, j in enumerate(mine):
+            columns[:, j if j < n_bits else j + n_actions] = (number % size >> power & 1).float()
+        columns[number, n_bits + number // size] = 1.0
+        tables.append(chances(pair, columns, i).numpy())
+        begin.append(begin[-1] + len(columns))
+        stride.append(size if acts else 0)
+        n_states.append(int((mine < n_bits).sum()))
+        parents += [int(j) if j < n_bits else int(j) - n_bits for j in mine]
+        first.append(len(parents))
+    ints: Callable[[list[int]], NDArray[np.int64]] = lambda values: np.array(values, dtype=np.int64)  # noqa: E731
+    return BitTables(
+        np.concatenate(tables), ints(begin[:-1]), ints(stride), ints(n_states), ints(parents), ints(first), n_actions
+    )
