@@ -31,8 +31,8 @@ HELD_OUT = 0.15
 _CHUNK = 256
 
 
-ADVISED_AT = 0.02
-"""Share of transitions with contrary rewards, or of held-out ones with a wrong reward, from which the agent says so."""
+CONTRARY, WRONG = 0.02, 0.1
+"""Shares of transitions with contrary rewards, and of held-out ones with a wrong reward, from which the agent says so."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,13 @@ class RewardReport:
     @property
     def advice(self) -> str | None:
         """What a user should know, in a sentence; None where all is well."""
-        if self.contrary > ADVISED_AT:
+        if self.contrary > CONTRARY:
             return (
                 f"{self.contrary:.1%} of rewards differ from what the same observation, action and next observation earned "
                 "before, so the reward is random or hangs on what is not observed (time, history); the agent plans with means. "
                 "mbagent.wrappers.History may show what is missing."
             )
-        if self.held_out < 1.0 - ADVISED_AT:
+        if self.held_out < 1.0 - WRONG:
             return (
                 f"The learned reward is right in only {self.held_out:.1%} of the transitions of held-out episodes: learn from "
                 "more steps, or give the agent a reward function (set_reward)."

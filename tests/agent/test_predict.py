@@ -113,7 +113,7 @@ def test_new_weights_and_more_learning_are_planned_with() -> None:
     def agent(**kwargs: Any) -> ModelLearningAgent:
         return ModelLearningAgent("MctsPolicy", Corridor(limit=30, **kwargs), seed=0, reward=goal, model="tabular")
 
-    one, other = agent().learn(800, log_interval=None), agent().learn(5, log_interval=None)
+    one, other = agent().learn(800, log_interval=None), agent().learn(2, log_interval=None)
     before = other.policy.plan(np.array([[0]])).values
     expected = one.policy.plan(np.array([[0]])).values
     other.policy.start_states = one.policy.start_states
