@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mbagent.models.base import Floats, States
 from mbagent.planning.foresight import ForeseeingPlanner, Foresight, likeliest_futures
+from mbagent.planning.machine_planner import MachinePlanner
 from mbagent.planning.planner import Planner, PlannerSettings
 from mbagent.policies import NO_GOAL, PlannerPolicy, as_batch
 from mbagent_envs.random_keys import derive
@@ -131,8 +132,9 @@ def explain(policy: PlannerPolicy, observation: Any, n_futures: int = 3, n_steps
     state = _single_state(policy, observation)
     # A deadline, or the last decision's tree, would make two explanations of one observation differ.
     settings = replace(policy.settings, time_budget=None, reuse_tree=False)
-    found = _foresee(_planner(policy, settings), state)
-    others = _other_values(policy, settings if found.machine_states else replace(settings, max_states=1), state)
+    planner = _planner(policy, settings, policy.planner)
+    found = _foresee(planner, state)
+    others = _other_values(policy, settings if found.machine_states else replace(settings, max_states=1), state, planner)
     values = np.concatenate([found.plan.values, *(plan_values for plan_values, _ in others)])
     taken = [int(found.plan.actions[0]), *(action for _, action in others)]
     return Explanation(
@@ -160,12 +162,14 @@ def _single_state(policy: PlannerPolicy, observation: Any) -> States:
     return policy.factored.encode(batch)
 
 
-def _planner(policy: PlannerPolicy, settings: PlannerSettings) -> Planner:
-    """A planner of its own, so that the policy's is left as it is."""
+def _planner(policy: PlannerPolicy, settings: PlannerSettings, like: Planner) -> Planner:
+    """A planner of its own, so that the policy's is left as it is; it looks ahead as another one does."""
     planner = policy.planner_class(settings)
     planner.set_model(policy.transition_model, policy.start_states)
     assert policy.goal is not None  # ``_single_state`` has seen to it
     planner.set_goal(policy.goal)
+    if isinstance(planner, MachinePlanner) and isinstance(like, MachinePlanner):
+        planner.look_ahead_as(like)
     return planner
 
 
@@ -175,12 +179,12 @@ def _foresee(planner: Planner, state: States) -> Foresight:
     return planner.foresee(state)
 
 
-def _other_values(policy: PlannerPolicy, settings: PlannerSettings, state: States) -> list[tuple[Floats, int]]:
+def _other_values(policy: PlannerPolicy, settings: PlannerSettings, state: States, like: Planner) -> list[tuple[Floats, int]]:
     """(values [1, A], action taken) of decisions with other random numbers."""
     found = []
     for repeat in range(1, REPEATS):
         seed = int(derive(settings.seed, _OTHER_LUCK, repeat)[0] >> np.uint64(1))
-        plan = _planner(policy, replace(settings, seed=seed)).plan(state)
+        plan = _planner(policy, replace(settings, seed=seed), like).plan(state)
         found.append((plan.values, int(plan.actions[0])))
     return found
 

@@ -72,6 +72,10 @@ class MachinePlanner:
         if self._machine is not None:
             self._machine.values = None
 
+    def look_ahead_as(self, other: MachinePlanner) -> None:
+        """Takes over how another planner of the same model and goal looks ahead, if that has found out."""
+        self._way = other._way
+
     def plan(self, roots: States) -> Plan:
         """See Planner."""
         machine = self._solved_machine()

@@ -61,7 +61,8 @@ def plays_better(task: Task, other: Way, usual: Way, act: Act) -> bool:
     for n_blocks in range(1, BLOCKS + 1):
         gains = trials[0].returns(n_blocks) - trials[1].returns(n_blocks)
         gain, error = float(gains.mean()), float(gains.std(ddof=1)) / PLAYERS**0.5
-        if gain < -HOPELESS * error or gain > SURELY * error:
+        alike = n_blocks > 1 and not gains.any()
+        if alike or gain < -HOPELESS * error or gain > SURELY * error:
             break
     return gain > CLEARLY * error
 
