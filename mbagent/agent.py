@@ -23,7 +23,7 @@ from mbagent.arguments import (
     fitting_model,
     planner_settings,
 )
-from mbagent.experience import Experience, ExperienceRecorder, distinct_rows
+from mbagent.experience import Experience, ExperienceRecorder, distinct_rows, warn_of_forgetting
 from mbagent.explanations import Explanation, explain
 from mbagent.exploration import EXPLORATIONS, Exploration, Watching, catch_up
 from mbagent.goals import GoalBook
@@ -274,6 +274,7 @@ class ModelLearningAgent(PrunableAlgorithm):
             self._recorder = ExperienceRecorder(self.experience.space, self.experience.dataset, self.n_envs)
             self._recorder.reset(self._last_obs)
             catch_up(self._explorer, self.experience.dataset)
+        warn_of_forgetting(self.policy.fitted and isinstance(self.model_name, str), self.experience.dataset)
         callbacks.on_training_start(locals(), globals())
         going, iteration = True, 0
         try:
@@ -324,8 +325,7 @@ class ModelLearningAgent(PrunableAlgorithm):
             self._recode(self.experience.coding())
         with fit_progress(progress_bar) as progress:
             report = self.model.fit(self.transitions, seed=self._planning_seed, progress=progress)
-        self._n_updates += 1
-        self.fit_report = report
+        self._n_updates, self.fit_report = self._n_updates + 1, report
         if report.advice is not None:
             warnings.warn(report.advice, UserWarning, stacklevel=3)
         starts = np.concatenate([self.policy.start_states, self.policy.factored.narrow(recorder.starts())])

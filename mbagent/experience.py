@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -108,7 +109,10 @@ class ExperienceRecorder:
         """
         assert self.states is not None
         if not np.isfinite(rewards).all():
-            raise ValueError("The environment returned a reward of NaN or infinity; mend the environment or wrap its rewards.")
+            raise ValueError(
+                "The environment returned a reward of NaN or infinity, or one beyond 3.4e38, which is more than the float32 of "
+                "vector environments can hold; mend the environment or wrap its rewards."
+            )
         following = self._space.encode(new_obs)
         next_states = following
         ended = np.flatnonzero(dones)
@@ -146,6 +150,18 @@ class ExperienceRecorder:
         """Distinct start states met so far, int64 [S, F], in the order met."""
         starts = np.concatenate(self._starts) if self._starts else np.zeros((0, len(self._space)), dtype=np.int64)
         return distinct_rows(starts)
+
+
+def warn_of_forgetting(learned: bool, data: TransitionDataset) -> None:
+    """Warns where the next fit would replace what an agent has learned: transitions that it was fitted to are not at hand."""
+    if learned and not len(data):
+        warnings.warn(
+            "This agent has weights, but not the transitions that they were learned from (it was loaded, or given weights), so "
+            "learn() will replace what it knows by what the new steps tell. Save agents with include=['transitions'], or call "
+            "load_transitions(path) first.",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def distinct_rows(rows: States) -> States:

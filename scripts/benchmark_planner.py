@@ -14,9 +14,8 @@ import os
 # Before NumPy and torch are imported: everything is timed on one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import csv
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -26,7 +25,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from mbagent.analysis.folders import replaced, set_aside
+from mbagent.analysis.folders import check_run, open_folder, write_csv
 from mbagent.analysis.planning_benchmark.crowds import WORLDS, compare_values
 from mbagent.analysis.planning_benchmark.latency import SETTINGS, steady
 from mbagent.analysis.planning_benchmark.latency import measure as measure_latency
@@ -184,12 +183,18 @@ _MEASURES: dict[str, Callable[[Args, Say], dict[str, Rows]]] = {
 }
 
 
-def save(path: Path, rows: Sequence[dict[str, Any]]) -> None:
-    """Writes a csv with a line for each row."""
-    with replaced(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+def check(args: Args) -> None:
+    """Refuses options that nothing can be measured with.
+
+    Raises:
+        ValueError: one of them.
+    """
+    check_run(args.output)
+    for part in args.parts:
+        if part not in PARTS:
+            raise ValueError(f"There is no part {part!r}; choose from {', '.join(PARTS)}.")
+    if min(args.worlds, args.roots, args.seeds, *args.budgets) < 1:
+        raise ValueError("All numbers must be at least 1.")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -200,23 +205,19 @@ def main(argv: list[str] | None = None) -> int:
     def say(text: str) -> None:
         console.print(text, highlight=False, markup=False, soft_wrap=True)
 
-    unknown = [part for part in args.parts if part not in PARTS]
-    if unknown or min(args.worlds, args.roots, args.seeds, *args.budgets) < 1:
-        wrong = (
-            f"There is no part {unknown[0]!r}; choose from {', '.join(PARTS)}." if unknown else "All numbers must be at least 1."
-        )
-        console.print(wrong, style="red", highlight=False, markup=False, soft_wrap=True)
+    try:
+        check(args)
+    except ValueError as error:
+        console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
         return 1
     torch.set_num_threads(1)
-    args.output.mkdir(parents=True, exist_ok=True)
-    if moved := set_aside(args.output):
-        say(f"Moved earlier results to {moved}.")
+    open_folder(args.output, console)
     tables: dict[str, Rows] = {}
     for part in args.parts:
         for name, rows in _MEASURES[part](args, say).items():
             if rows:
                 tables[name] = rows
-                save(args.output / f"{name.replace(' ', '_')}.csv", rows)
+                write_csv(args.output / f"{name.replace(' ', '_')}.csv", rows)
     options = sys.argv[1:] if argv is None else argv
     pictures = write_page(args.output / "report.html", tables, " ".join(["scripts/benchmark_planner.py", *options]))
     for name, png in pictures.items():

@@ -12,7 +12,6 @@ import os
 # Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import csv
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +23,7 @@ from rich.table import Table
 
 from mbagent.analysis.external.coverage import Row, Study, draw_coverage, run_study
 from mbagent.analysis.external.worlds import exact_world, find_world
-from mbagent.analysis.folders import replaced
+from mbagent.analysis.folders import check_run, open_folder, replaced, write_csv
 from mbagent.analysis.parallel import run_all
 from mbagent.exploration import EXPLORATIONS
 
@@ -83,11 +82,12 @@ def main(argv: list[str] | None = None) -> int:
     args = tyro.cli(Args, args=argv, description=__doc__.splitlines()[0])
     console = Console()
     try:
+        check_run(args.output, args.workers)
         studies = plan(args)
     except ValueError as error:
         console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
         return 1
-    args.output.mkdir(parents=True, exist_ok=True)
+    open_folder(args.output, console)
     rows: list[Row] = []
 
     def line(result: list[Row]) -> str:
@@ -96,10 +96,7 @@ def main(argv: list[str] | None = None) -> int:
 
     for result in run_all(run_study, studies, workers=args.workers, console=console, name=line):
         rows += result
-        with replaced(args.output / "coverage.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
+        write_csv(args.output / "coverage.csv", rows)
     with replaced(args.output / "coverage.png") as temporary:
         temporary.write_bytes(draw_coverage(rows))
     show(rows, console)

@@ -15,7 +15,6 @@ import os
 # Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import csv
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -29,7 +28,7 @@ from rich.table import Table
 
 from mbagent.analysis.external.experiment import AGENTS, TRUE, Row, Task, run_task
 from mbagent.analysis.external.worlds import CONTINUOUS, WORLDS, find_world
-from mbagent.analysis.folders import replaced, set_aside
+from mbagent.analysis.folders import check_run, open_folder, write_csv
 from mbagent.analysis.parallel import run_all
 from mbagent.analysis.statistics import interquartile_interval
 
@@ -88,14 +87,6 @@ def plan(args: Args) -> list[Task]:
     return tasks
 
 
-def save(path: Path, rows: Sequence[Row]) -> None:
-    """Writes a csv with a line for each row."""
-    with replaced(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def show(rows: Sequence[Row], console: Console) -> None:
     """Prints each agent in each world: normalised return as interquartile mean over seeds, the rest as means."""
     names = (
@@ -134,15 +125,14 @@ def main(argv: list[str] | None = None) -> int:
     args = tyro.cli(Args, args=argv, description=__doc__.splitlines()[0])
     console = Console()
     try:
+        check_run(args.output, args.workers)
         tasks = plan(args)
     except ValueError as error:
         console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
         return 1
     for extra in sorted({world.missing or "" for world in map(find_world, args.worlds)} - {""}):
         console.print(f'Left out what needs pip install "mbagent[{extra}]".', highlight=False, markup=False, soft_wrap=True)
-    args.output.mkdir(parents=True, exist_ok=True)
-    if moved := set_aside(args.output):
-        console.print(f"Moved earlier results to {moved}.", highlight=False, soft_wrap=True)
+    open_folder(args.output, console)
     rows: list[Row] = []
 
     def line(row: Row) -> str:
@@ -150,7 +140,7 @@ def main(argv: list[str] | None = None) -> int:
 
     for row in run_all(run_task, tasks, workers=args.workers, console=console, name=line):
         rows.append(row)
-        save(args.output / "results.csv", rows)
+        write_csv(args.output / "results.csv", rows)
     if rows:
         show(rows, console)
         console.print(f"Wrote results.csv to {args.output}.", highlight=False, soft_wrap=True)

@@ -20,7 +20,7 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
-from mbagent.analysis.folders import set_aside
+from mbagent.analysis.folders import check_run, open_folder
 from mbagent.analysis.forecasts.experiment import CASES, Outcome, Return, Score, Settings, plan, run_task, save_csv
 from mbagent.analysis.forecasts.page import write_page
 from mbagent.analysis.parallel import run_all
@@ -85,16 +85,11 @@ def main(argv: list[str] | None = None) -> int:
     console = Console()
     try:
         settings = settings_of(args)
-        if args.workers < 1:
-            raise ValueError(f"--workers must be at least 1 process, got {args.workers}.")
-        if args.output.exists() and not args.output.is_dir():
-            raise ValueError(f"--output must be a folder, and {args.output} is a file.")
+        check_run(args.output, args.workers)
     except ValueError as error:
         console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
         return 1
-    args.output.mkdir(parents=True, exist_ok=True)
-    if moved := set_aside(args.output):
-        console.print(f"Moved earlier results to {moved}.", highlight=False, soft_wrap=True)
+    open_folder(args.output, console)
     outcomes: list[Outcome] = []
     command = shlex.join(["python", "scripts/forecast.py", *(sys.argv[1:] if argv is None else argv)])
     for outcome in run_all(run_task, plan(settings), workers=args.workers, console=console, name=_line):

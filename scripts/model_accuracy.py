@@ -14,11 +14,10 @@ import os
 # Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import csv
 import importlib.util
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from mbagent.analysis.folders import replaced, set_aside
+from mbagent.analysis.folders import check_run, open_folder, write_csv
 from mbagent.analysis.model_accuracy.experiment import CASES, Outcome, Score, Settings, means, plan, run_task
 from mbagent.analysis.model_accuracy.page import averaged, shown, write_page
 from mbagent.analysis.model_accuracy.studies import STUDIES, Study, parts
@@ -63,8 +62,7 @@ class Args:
 
 def settings_of(args: Args) -> Settings:
     """The settings that the options stand for."""
-    if args.workers < 1:
-        raise ValueError(f"--workers must be at least 1 process, got {args.workers}.")
+    check_run(args.output, args.workers)
     return Settings(
         cases=args.cases,
         models=args.models,
@@ -73,14 +71,6 @@ def settings_of(args: Args) -> Settings:
         first_seed=args.first_seed,
         n_tests=args.n_tests if args.n_tests is not None else 100_000 if args.full else 20_000,
     )
-
-
-def save(path: Path, scores: list[Score]) -> None:
-    """Writes a csv with a line for each score."""
-    with replaced(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [column.name for column in fields(Score)])
-        writer.writeheader()
-        writer.writerows(asdict(score) for score in scores)
 
 
 def show(scores: list[Score], console: Console) -> None:
@@ -128,14 +118,6 @@ def check_studies(names: Sequence[str]) -> None:
         raise ValueError('The study minatar needs MinAtar: pip install "mbagent[minatar]".')
 
 
-def save_rows(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Writes a csv with a line for each row of a study."""
-    with replaced(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-
-
 def show_rows(study: str, rows: list[dict[str, Any]], console: Console) -> None:
     """Prints a study's means over seeds."""
     table = Table(*rows[0], title=(STUDIES[study].__doc__ or "").splitlines()[0])
@@ -155,9 +137,7 @@ def main(argv: list[str] | None = None) -> int:
     except ValueError as error:
         console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
         return 1
-    args.output.mkdir(parents=True, exist_ok=True)
-    if moved := set_aside(args.output):
-        console.print(f"Moved earlier results to {moved}.", highlight=False, soft_wrap=True)
+    open_folder(args.output, console)
     scores: list[Score] = []
     rows: dict[str, list[dict[str, Any]]] = {}
 
@@ -166,7 +146,7 @@ def main(argv: list[str] | None = None) -> int:
 
     for outcome in run_all(run_task, tasks, workers=args.workers, console=console, name=line):
         scores += outcome.scores
-        save(args.output / "results.csv", scores)
+        write_csv(args.output / "results.csv", [asdict(score) for score in scores])
     if scores:
         show(scores, console)
     questions = [
@@ -179,7 +159,7 @@ def main(argv: list[str] | None = None) -> int:
         answer, questions, workers=args.workers, console=console, name=lambda done: f"{done[0].study}, seed {done[0].seed}"
     ):
         rows.setdefault(question.study, []).extend(found)
-        save_rows(args.output / f"{question.study}.csv", rows[question.study])
+        write_csv(args.output / f"{question.study}.csv", rows[question.study])
     accuracy = [{"world": c, "model": m, "steps": n, **figures} for (c, m, n), figures in sorted(means(scores).items())]
     pictures = write_page(args.output / "report.html", rows, accuracy, "scripts/model_accuracy.py" + " --full" * args.full)
     for name, png in pictures.items():

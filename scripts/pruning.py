@@ -12,19 +12,17 @@ import os
 # Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import csv
 import shlex
 import sys
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import tyro
 from rich.console import Console
 
-from mbagent.analysis.folders import set_aside
+from mbagent.analysis.folders import check_run, open_folder, write_csv
 from mbagent.analysis.parallel import run_all
-from mbagent.analysis.pruning.experiment import FRACTIONS, GAMES, Networks, Outcome, Row, Settings, plan, run_task
+from mbagent.analysis.pruning.experiment import FRACTIONS, GAMES, Networks, Outcome, Settings, plan, run_task
 from mbagent.analysis.pruning.page import write_page
 
 
@@ -67,30 +65,17 @@ def settings_of(args: Args) -> Settings:
     )
 
 
-def save(path: Path, rows: Sequence[Row]) -> None:
-    """Writes a csv with a line for each."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(Row)])
-        writer.writeheader()
-        writer.writerows(asdict(row) for row in rows)
-
-
 def main(argv: list[str] | None = None) -> int:
     """Runs the command line and returns its exit code."""
     args = tyro.cli(Args, args=argv, description=__doc__.splitlines()[0])
     console = Console()
     try:
         settings = settings_of(args)
-        if args.workers < 1:
-            raise ValueError(f"--workers must be at least 1 process, got {args.workers}.")
-        if args.output.exists() and not args.output.is_dir():
-            raise ValueError(f"--output must be a folder, and {args.output} is a file.")
+        check_run(args.output, args.workers)
     except ValueError as error:
         console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
         return 1
-    args.output.mkdir(parents=True, exist_ok=True)
-    if moved := set_aside(args.output):
-        console.print(f"Moved earlier results to {moved}.", highlight=False, soft_wrap=True)
+    open_folder(args.output, console)
     outcomes: list[Outcome] = []
     command = shlex.join(["python", "scripts/pruning.py", *(sys.argv[1:] if argv is None else argv)])
     work = run_all(
@@ -98,7 +83,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     for outcome in work:
         outcomes.append(outcome)
-        save(args.output / "results.csv", [row for o in outcomes for row in o.rows])
+        write_csv(args.output / "results.csv", [asdict(row) for o in outcomes for row in o.rows])
         for name, png in write_page(args.output / "report.html", outcomes, settings, command).items():
             (args.output / f"{name}.png").write_bytes(png)
     console.print(f"Wrote report.html, results.csv and the figures to {args.output}.")

@@ -37,7 +37,7 @@ from mbagent.analysis.accuracy.results import (
 from mbagent.analysis.accuracy.samplers import FitOptions
 from mbagent.analysis.accuracy.scores import Score
 from mbagent.analysis.accuracy.trials import TRIALS
-from mbagent.analysis.folders import set_aside
+from mbagent.analysis.folders import check_run, open_folder
 from mbagent.analysis.parallel import run_all
 
 QUICK_TRIALS = tuple(trial.name for trial in TRIALS if trial.options.d <= 8)
@@ -92,10 +92,7 @@ def prepare(args: Args, settings: Settings, console: Console) -> Settings:
     Raises:
         ValueError: there is nothing to go on with, or it was measured with other options.
     """
-    if args.output.exists() and not args.output.is_dir():
-        raise ValueError(f"--output must be a folder, and {args.output} is a file.")
-    if args.workers < 1:
-        raise ValueError(f"--workers must be at least 1 process, got {args.workers}.")
+    check_run(args.output, args.workers)
     kept = args.output / "settings.json"
     if args.report_only:
         return load_settings(kept)
@@ -103,8 +100,8 @@ def prepare(args: Args, settings: Settings, console: Console) -> Settings:
     if args.resume and kept.exists():
         if load_settings(kept).measured() != settings.measured():
             raise ValueError(f"{args.output} was measured with other options ({kept}); give those, or another --output.")
-    elif moved := set_aside(args.output):
-        console.print(f"Moved earlier results to {moved}.", highlight=False, soft_wrap=True)
+    else:
+        open_folder(args.output, console)
     save_settings(kept, settings)
     return settings
 

@@ -9,6 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mbagent.models.base import BaseTransitionModel, FitReport, Randomness, Successors, as_keys
+from mbagent.planning.planner import Planner
 from mbagent.transitions import TransitionDataset
 from mbagent_envs.random_keys import uniforms
 
@@ -69,6 +70,24 @@ def optimal_q(table: Floats, rewards: Floats, gamma: float, ends: tuple[int, ...
 def arrival_goal(rewards: Floats) -> Callable[[Ints, Ints, Ints], Floats]:
     """Reward for the state arrived at."""
     return lambda states, actions, next_states: rewards[next_states[:, 0]]
+
+
+def planner_for(
+    planner: Planner, table: Floats, rewards: Floats, ends: tuple[int, ...] = (), start: tuple[int, ...] = (0,)
+) -> Planner:
+    """The planner with a table as its world, and rewards for arriving; without start states each root has its own machine."""
+    planner.set_model(TableWorld(table, ends), np.array(start, dtype=np.int64)[:, None])
+    planner.set_goal(arrival_goal(rewards))
+    return planner
+
+
+def prize_corridor(n: int = 12, prize: int = 9) -> tuple[Floats, Floats]:
+    """A corridor, left and right, as (table, rewards for arriving): the prize lies ``prize`` steps from its left end."""
+    table, rewards = np.zeros((n, 2, n)), np.zeros(n)
+    for s in range(n):
+        table[s, 0, max(s - 1, 0)] = table[s, 1, min(s + 1, n - 1)] = 1.0
+    rewards[prize] = 1.0
+    return table, rewards
 
 
 class Corridor(gym.Env[Any, Any]):

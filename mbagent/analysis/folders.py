@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import csv
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+from rich.console import Console
 
 
 @contextmanager
@@ -28,3 +32,30 @@ def set_aside(folder: Path) -> Path | None:
     for path in old:
         path.rename(target / path.name)
     return target
+
+
+def check_run(folder: Path, workers: int = 1) -> None:
+    """Refuses what no run can begin with.
+
+    Raises:
+        ValueError: the folder of results is a file, or there are no processes to work.
+    """
+    if workers < 1:
+        raise ValueError(f"--workers must be at least 1 process, got {workers}.")
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"--output must be a folder, and {folder} is a file.")
+
+
+def open_folder(folder: Path, console: Console) -> None:
+    """Makes a folder ready for a run; says where the results of an earlier one have gone."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if moved := set_aside(folder):
+        console.print(f"Moved earlier results to {moved}.", highlight=False, markup=False, soft_wrap=True)
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Writes a csv with a line for each row; all rows have the keys of the first."""
+    with replaced(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)

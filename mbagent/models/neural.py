@@ -37,7 +37,13 @@ from mbagent.transitions import TransitionBatch, TransitionDataset
 
 
 class NeuralTransitionModel(NetworkPair):
-    """A predictor network, alone or with a conditioner network. Arguments are those of NetworkPair."""
+    """A predictor network, alone or with a conditioner network. Arguments are those of NetworkPair.
+
+    Attributes:
+        use_tables: whether truth tables take the networks' place once few inputs of each bit are left; set it before sampling.
+    """
+
+    use_tables = True
 
     def _changed(self) -> None:
         self._forward: CompiledBody | None = None
@@ -268,6 +274,8 @@ class NeuralTransitionModel(NetworkPair):
 
     def tables(self) -> BitTables | None:
         """A pruned model's truth tables, which it samples and searches with; None where a variable has too many parents left."""
+        if not self.use_tables:
+            return None
         if self._tables is None and len(self._marks) and (pair := self._pair()):
             self._tables = tabulate(pair, self._marks)
         return self._tables

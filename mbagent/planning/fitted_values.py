@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_array
 
 from mbagent.models.base import Actions, States, TransitionModel
 from mbagent.models.state_graph import GraphArrays, StateGraph
@@ -75,6 +76,30 @@ class Task:
     seed: int
 
 
+class _Columns:
+    """The sums of weights of many states, over and over: only what differs from each factor's commonest value is looked up.
+
+    Args:
+        states: int64 [N, F].
+        first: where each factor's weights begin, int64 [F].
+        size: number of weights, with the one for all states.
+    """
+
+    def __init__(self, states: States, first: Indices, size: int) -> None:
+        self._common = first + np.array([np.bincount(column).argmax() for column in states.T], dtype=np.int64)
+        columns = first + states
+        rows, factors = np.nonzero(columns != self._common)
+        ones = np.ones(len(rows))
+        where = np.concatenate([rows, rows]), np.concatenate([columns[rows, factors], self._common[factors]])
+        self._differences = csr_array((np.concatenate([ones, -ones]), where), shape=(len(states), size))
+
+    def values(self, leaf: LeafValues) -> Floats:
+        """What the states are worth, [N]; see ``leaf_value``."""
+        sums = leaf.weights[-1] + leaf.weights[self._common].sum() + self._differences @ leaf.weights
+        values: Floats = np.clip(sums, leaf.low, leaf.high)
+        return values
+
+
 @compiled
 def _back_up(graph: GraphArrays, rewards: Floats, gamma: float, nodes: Indices, v: Floats, q: Floats, out: Floats) -> None:
     for i in range(len(nodes)):
@@ -87,6 +112,10 @@ class _Regression:
     Args:
         states: int64 [N, F].
         cardinalities: of the factors.
+
+    Attributes:
+        first: where each factor's weights begin, int64 [F].
+        size: number of weights, with the one for all states.
     """
 
     def __init__(self, states: States, cardinalities: tuple[int, ...]) -> None:
@@ -97,7 +126,7 @@ class _Regression:
         self._used = np.flatnonzero(columns.min(axis=0) < columns.max(axis=0))
         self._mean = columns[:, self._used].mean(axis=0)
         self._centred = columns[:, self._used] - self._mean
-        self._size = columns.shape[1]
+        self.size = columns.shape[1] + 1
         wide = len(self._used) > len(states)
         x = self._centred if not wide else self._centred.T
         self._factor, self._wide = cho_factor(x.T @ x + RIDGE * np.eye(x.shape[1])), wide
@@ -106,7 +135,7 @@ class _Regression:
         """Weights [sum of cardinalities + 1] for values [N] of the states."""
         mean, x = values.mean(), self._centred
         found = x.T @ cho_solve(self._factor, values - mean) if self._wide else cho_solve(self._factor, x.T @ (values - mean))
-        weights = np.zeros(self._size + 1)
+        weights = np.zeros(self.size)
         weights[self._used] = found
         weights[-1] = mean - float(found @ self._mean)
         return weights
@@ -175,11 +204,11 @@ def _fit(task: Task, states: States, leaf: LeafValues, number: int) -> LeafValue
         return LOWEST_KNOWN
     regression = _Regression(graph.states[nodes], task.model.cardinalities)
     low, high = (float(end) / (1.0 - task.gamma) for end in (min(rewards.min(), 0.0), max(rewards.max(), 0.0)))
-    none, moved = np.zeros(len(graph), dtype=np.bool_), SETTLED * float(np.abs(rewards).max())
+    columns, moved = _Columns(graph.states, regression.first, regression.size), SETTLED * float(np.abs(rewards).max())
     for _ in range(SWEEPS):
         _back_up(graph.arrays, rewards, task.gamma, nodes, v, q, found)
-        leaf, before = LeafValues(regression.fit(found), regression.first, low, high), v.copy()
-        evaluate(leaf, graph.states, none, v)
+        leaf, before = LeafValues(regression.fit(found), regression.first, low, high), v
+        v = columns.values(leaf)
         if np.abs(v - before).max() <= moved:
             break
     return leaf if np.isfinite(leaf.weights).all() else LOWEST_KNOWN

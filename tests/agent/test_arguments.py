@@ -136,7 +136,7 @@ def test_weights_that_fit_only_in_part_change_nothing(runner: ModelLearningAgent
 
 def test_learning_goes_on_after_loading_without_the_custom_goal(runner: ModelLearningAgent, tmp_path: Path) -> None:
     runner.set_reward(lambda obs, action, next_obs: next_obs[:, 0])
-    runner.save(tmp_path / "left.zip")
+    runner.save(tmp_path / "left.zip", include=["transitions"])
     runner.set_reward(None)
     loaded = ModelLearningAgent.load(tmp_path / "left.zip", env=gym.make(GEYSER))
     loaded.learn(200, log_interval=None)

@@ -58,6 +58,13 @@ def test_a_loaded_agent_learns_on(agent: ModelLearningAgent, tmp_path: Path) -> 
     assert len(loaded.transitions) == 3200
 
 
+def test_learning_on_without_the_transitions_is_warned_of(agent: ModelLearningAgent, tmp_path: Path) -> None:
+    agent.save(tmp_path / "agent")
+    loaded = ModelLearningAgent.load(tmp_path / "agent", env=gym.make(GEYSER, hit_cost=5.0))
+    with pytest.warns(UserWarning, match="will replace what it knows"):
+        loaded.learn(200, log_interval=None)
+
+
 def test_a_custom_reward_must_be_given_again(agent: ModelLearningAgent, tmp_path: Path) -> None:
     env = gym.make(GEYSER)
     agent.set_reward(corner)

@@ -4,7 +4,7 @@ import pytest
 from mbagent.models.base import Bools, Floats, Randomness, States, Successors, as_keys
 from mbagent.models.known import KnownModel
 from mbagent.models.systematic import independent_successors
-from mbagent.planning.fitted_values import RIDGE, Task, _Regression, greedy_actions, learn_values
+from mbagent.planning.fitted_values import RIDGE, Task, _Columns, _Regression, greedy_actions, learn_values
 from mbagent.planning.leaf_values import LOWEST_KNOWN, LeafValues, evaluate, leaf_value
 from mbagent_envs.random_keys import uniforms
 
@@ -86,6 +86,14 @@ def test_the_seed_decides() -> None:
     first, again, other = (learn_values(task(Bulbs(4), seed=seed))[0] for seed in (1, 1, 2))
     np.testing.assert_array_equal(first.weights, again.weights)
     assert (first.weights != other.weights).any()
+
+
+def test_sums_of_many_states_are_those_of_each() -> None:
+    rng = np.random.default_rng(0)
+    states = np.column_stack([rng.integers(k, size=40) for k in (2, 3, 5)])
+    leaf = LeafValues(rng.normal(size=11), np.array([0, 2, 5]), -1.0, 2.0)
+    expected = [leaf_value(leaf, state) for state in states]
+    np.testing.assert_allclose(_Columns(states, leaf.first, 11).values(leaf), expected, atol=1e-12)
 
 
 def test_values_are_sums_within_bounds() -> None:

@@ -4,16 +4,10 @@ import pytest
 from mbagent.planning.flat_monte_carlo import FlatMonteCarlo
 from mbagent.planning.machine_planner import MachinePlanner
 from mbagent.planning.mcts import MctsPlanner
-from mbagent.planning.planner import Planner, PlannerSettings
-from tests.worlds import Floats, TableWorld, arrival_goal, optimal_q, random_table
+from mbagent.planning.planner import PlannerSettings
+from tests.worlds import optimal_q, planner_for, prize_corridor, random_table
 
 ROLLOUTS = PlannerSettings(leaf_values="rollouts", backup="mean", num_simulations=4000, horizon=12, gamma=0.8, c_uct=0.7)
-
-
-def planner_for(planner: Planner, table: Floats, rewards: Floats, ends: tuple[int, ...] = ()) -> Planner:
-    planner.set_model(TableWorld(table, ends), np.array([[0]]))
-    planner.set_goal(arrival_goal(rewards))
-    return planner
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -29,12 +23,7 @@ def test_search_finds_the_best_action_of_a_stochastic_world(seed: int, settings:
 @pytest.mark.parametrize("seed", range(3))
 def test_search_repairs_a_lookahead_too_short_to_see_the_prize(seed: int) -> None:
     # A corridor: the prize lies 9 steps to the right, the lookahead machine holds 4 states; the search must grow it.
-    n = 12
-    table = np.zeros((n, 2, n))
-    for s in range(n):
-        table[s, 0, max(s - 1, 0)] = table[s, 1, min(s + 1, n - 1)] = 1.0
-    rewards = np.zeros(n)
-    rewards[9] = 1.0
+    table, rewards = prize_corridor()
     short = PlannerSettings(max_states=1, lookahead_states=4, num_simulations=600, wave=4, seed=seed)
     greedy = planner_for(MachinePlanner(short), table, rewards).plan(np.array([[0]]))
     assert greedy.values[0, 0] == greedy.values[0, 1]

@@ -124,13 +124,13 @@ def naive_sample(model: NeuralTransitionModel, states: Ints, actions: Ints, seed
 
 @contextmanager
 def using(model: NeuralTransitionModel, certain: float, sweeps: int) -> Iterator[None]:
-    """The model with other settings of its sampler."""
-    config = model.config
-    model.config = replace(config, certain=certain, sweeps=sweeps)
+    """The model with other settings of its sampler, and with its networks even where it has truth tables."""
+    config, tables = model.config, model.use_tables
+    model.config, model.use_tables = replace(config, certain=certain, sweeps=sweeps), False
     try:
         yield
     finally:
-        model.config = config
+        model.config, model.use_tables = config, tables
 
 
 def microseconds(call: Callable[[], object], rows: int, at_least: float = 0.3, repetitions: int = 5) -> float:
