@@ -37,7 +37,7 @@ from mbagent.analysis.planning_benchmark.peers import PeerError
 from mbagent.analysis.planning_benchmark.quality import TOY_TEXT, play_game, play_table, scales, summary
 from mbagent.analysis.planning_benchmark.regret import Settings, compare
 from mbagent.analysis.planning_benchmark.sampling import compare_short_cut, compare_with_naive
-from mbagent.analysis.planning_benchmark.start import GAMES, first_decision
+from mbagent.analysis.planning_benchmark.start import GAMES, first_decisions
 
 Rows = list[dict[str, Any]]
 Say = Callable[[str], None]
@@ -104,10 +104,10 @@ def measure_decisions(args: Args, say: Say) -> dict[str, Rows]:
 
 def measure_start(args: Args, say: Say) -> dict[str, Rows]:
     """The first decision of a new process."""
-    rows = []
+    rows: Rows = []
     for key in GAMES:
         say(f"start: {key}")
-        rows.append(first_decision(key, args.first_seed + 1000))
+        rows += first_decisions(key, args.first_seed + 1000)
     return {"start": rows}
 
 
