@@ -38,13 +38,13 @@ class PrunableAlgorithm(SavableAlgorithm):
     def prune(self, fraction: float, *, progress_bar: bool = False, config: PruningConfig | None = None) -> Self:
         """Removes the smallest weights of the model's networks, trains what is left on the transitions met, and plans on with it.
 
-        Each network loses this share of its connections; the goal stays. Pruned again, the agent goes on from what is left; to
-        ask for less than is gone only trains. ``learn`` fits anew, with all connections.
+        Each network loses this share of its connections, and those left over that the transitions do not call for; the goal
+        stays. Pruned again, the agent goes on from what is left. ``learn`` fits anew, with all connections.
 
         Args:
-            fraction: share of the connections that are gone afterwards, 0 or more and less than 1.
+            fraction: least share of the connections that are gone afterwards, 0 or more and less than 1.
             progress_bar: shows one.
-            config: how, see PruningConfig; by default a few at a time.
+            config: how, see PruningConfig; ``PruningConfig(evidence=False)`` removes this share and no more.
 
         Raises:
             ValueError: a fraction out of range, nothing learned yet, or no transitions to train on (after ``load``).

@@ -89,8 +89,9 @@ class NeuralTransitionModel(NetworkPair):
 
         Args:
             data: what the model was fitted to; the same ``seed`` holds out the same rows.
-            fraction: share of the connections of each network that are gone afterwards, in [0, 1). What is gone stays gone when
-                the model is pruned again; ``fit`` begins anew with all connections.
+            fraction: least share of the connections of each network that are gone afterwards, in [0, 1); more go where the data
+                do not call for them (``PruningConfig.evidence``). What is gone stays gone when the model is pruned again; ``fit``
+                begins anew with all connections.
             seed: of the rows held out and of the batches.
             progress: is told the share done, 0 ... 1.
             config: see PruningConfig.
@@ -105,7 +106,7 @@ class NeuralTransitionModel(NetworkPair):
         train, held_out = examples(rows[0]), examples(rows[1])
         trainer = Trainer(self.codec, self.predictor, self.conditioner, self.config.training)
         try:
-            epochs = prune_networks(trainer, self.connections(), fraction, train, held_out, seed, progress, config)
+            epochs = prune_networks(trainer, self.connections(), fraction, train, held_out, len(rows[0]), seed, progress, config)
             pair = self._pair()
             marks = find_parents(pair, train) if pair else NO_MARKS
         except BaseException:

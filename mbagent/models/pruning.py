@@ -36,12 +36,15 @@ class PruningConfig:
         steps: how often some go in that time.
         shrink: how strongly all weights are drawn to 0 in that time, so that what is of no use becomes small (the weight of the
             sum of absolute values in the loss); nothing draws afterwards.
+        evidence: whether connections that the transitions do not call for go, too, at whatever share (see ``evidence``); False:
+            just the smallest ones. Weights shared over positions are not looked at.
     """
 
     gradual: bool = True
     removal: float = 0.6
     steps: int = 50
     shrink: float = 1e-3
+    evidence: bool = True
 
 
 class Connections:

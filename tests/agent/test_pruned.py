@@ -10,6 +10,7 @@ from mbagent import ModelLearningAgent
 from mbagent.models.config import NeuralConfig
 from mbagent.models.factory import register_model
 from mbagent.models.neural import NeuralTransitionModel
+from mbagent.models.pruning import PruningConfig
 from mbagent.models.training import TrainingConfig
 from mbagent.spaces import FactoredSpace
 
@@ -31,7 +32,7 @@ def test_a_pruned_agent_plans_on_with_its_goal_and_survives_saving(tmp_path: Pat
     one = agent().learn(400, log_interval=None)
     one.set_reward(lambda obs, action, next_obs: next_obs[:, 0].astype(float))
     obs = np.stack([one.observation_space.sample() for _ in range(4)])
-    assert one.prune(0.6) is one
+    assert one.prune(0.6, config=PruningConfig(evidence=False)) is one
     assert one.fit_report is not None
     assert one.fit_report.log["pruned"] == pytest.approx(0.6, abs=0.01)
     actions, _ = one.predict(obs)
@@ -40,7 +41,7 @@ def test_a_pruned_agent_plans_on_with_its_goal_and_survives_saving(tmp_path: Pat
     assert np.array_equal(other.predict(obs)[0], actions)
     other.prune(0.8)  # with transitions it goes on
     assert other.fit_report is not None
-    assert other.fit_report.log["pruned"] == pytest.approx(0.8, abs=0.01)
+    assert other.fit_report.log["pruned"] >= 0.79  # at least what was asked for
 
 
 def test_mistakes_get_one_sentence_and_change_nothing(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ def fitted(data: TransitionDataset, **changes: object) -> NeuralTransitionModel:
 def test_what_is_left_still_knows_the_world_and_survives_saving() -> None:
     data = shifted()
     model = fitted(data)
-    report = model.prune(data, 0.9)
+    report = model.prune(data, 0.9, config=PruningConfig(evidence=False))
     assert report.log["pruned"] == pytest.approx(0.9, abs=0.002)
     assert report.conditioner_loss == pytest.approx(np.log(2.0), abs=0.05)  # one coin is all that is not known
     for connections in model.connections().values():
@@ -49,11 +49,12 @@ def test_what_is_left_still_knows_the_world_and_survives_saving() -> None:
 def test_pruned_again_nothing_comes_back_and_a_new_fit_has_everything() -> None:
     data = shifted(400)
     model = fitted(data)
-    model.prune(data, 0.8)
+    by_size = PruningConfig(evidence=False)
+    model.prune(data, 0.8, config=by_size)
     gone = {k: v == 0.0 for k, v in model.state_dict().items() if k.endswith("weight")}
-    model.prune(data, 0.9)
+    model.prune(data, 0.9, config=by_size)
     assert all((model.state_dict()[k][mask] == 0.0).all() for k, mask in gone.items())
-    assert model.prune(data, 0.5).log["pruned"] == pytest.approx(0.9, abs=0.005)
+    assert model.prune(data, 0.5, config=by_size).log["pruned"] == pytest.approx(0.9, abs=0.005)
     rows = data.rows()
     model.observe(rows.states[:8], rows.actions[:8], rows.next_states[:8], rows.terminated[:8])
     assert all((model.state_dict()[k][mask] == 0.0).all() for k, mask in gone.items())
