@@ -180,7 +180,7 @@ def trim_predictor(predictor: DensePredictor, rows: Examples, n_transitions: int
         rows: distinct transitions.
         n_transitions: that they stand for.
     """
-    rows, codec, out = _some(rows), predictor.codec, predictor.out
+    rows, codec, out = rows.spread(ROWS), predictor.codec, predictor.out
     inputs = values = codec.inputs(rows.states, rows.actions)
     layers = [layer for layer in predictor.layers if isinstance(layer, Affine)]
     activation = ACTIVATIONS[predictor.activation]
@@ -209,7 +209,7 @@ def trim_predictor(predictor: DensePredictor, rows: Examples, n_transitions: int
 @torch.no_grad()
 def trim_conditioner(conditioner: Conditioner, predictor: nn.Module, rows: Examples, n_transitions: int) -> None:
     """The same for each of a conditioner's groups, given what the predictor says. Arguments as above."""
-    rows, codec, size = _some(rows), conditioner.codec, conditioner.group_size
+    rows, codec, size = rows.spread(ROWS), conditioner.codec, conditioner.group_size
     columns = torch.cat((codec.inputs(rows.states, rows.actions), codec.targets(rows.outcomes)), dim=1)
     logits = conditioner(rows.states, rows.actions, rows.outcomes)
     if conditioner.correction:
@@ -226,11 +226,6 @@ def trim_conditioner(conditioner: Conditioner, predictor: nn.Module, rows: Examp
         layers = Layers(columns, groups.weight[of_group], groups.bias[of_group], readout, offset, activation, torch.arange(n))
         while layers.trim(judge):
             pass
-
-
-def _some(rows: Examples) -> Examples:
-    """Rows spread evenly over all of them, ROWS at most."""
-    return rows.select(torch.linspace(0, len(rows) - 1, min(len(rows), ROWS)).long()) if len(rows) else rows
 
 
 def _columns(codec: FactorCodec, logits: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -21,7 +22,7 @@ from mbagent.models.base import (
     as_keys,
 )
 from mbagent.models.bit_networks import CausalBits, pack_bits
-from mbagent.models.bit_tables import BitTables, sample_tables
+from mbagent.models.bit_rules import BitRules, compile_rules, sample_rules
 from mbagent.models.kernels import GroupWeights
 from mbagent.models.network_pair import NO_MARKS, NetworkPair
 from mbagent.models.networks import DensePredictor
@@ -29,27 +30,31 @@ from mbagent.models.packing import CompiledBody, as_rows, compiled_body, pack_de
 from mbagent.models.pruning import PruningConfig, check_fraction
 from mbagent.models.retraining import prune_networks
 from mbagent.models.samplers import log_prob_causal, sample_causal, sample_independent
+from mbagent.models.sparse_networks import pack_sparse
 from mbagent.models.sweeps import sample_sweeps
 from mbagent.models.systematic import causal_successors, independent_successors
-from mbagent.models.tabulate import Pair, find_parents, tabulate
+from mbagent.models.tabulate import Pair, find_parents, tabulable, tabulate
 from mbagent.models.training import Examples, Trainer, as_examples, examples, one_thread
 from mbagent.transitions import TransitionBatch, TransitionDataset
+
+PrunedAs: TypeAlias = Literal["tables", "connections", "matrices"]
 
 
 class NeuralTransitionModel(NetworkPair):
     """A predictor network, alone or with a conditioner network. Arguments are those of NetworkPair.
 
     Attributes:
-        use_tables: whether truth tables take the networks' place once few inputs of each bit are left; set it before sampling.
+        pruned_as: what a pruned model of bits is drawn from: "tables" of bits that few inputs are left of, the others'
+            connections; "connections" of all; or the whole "matrices", as before pruning.
     """
 
-    use_tables = True
+    pruned_as: PrunedAs = "tables"
 
     def _changed(self) -> None:
         self._forward: CompiledBody | None = None
         self._groups: GroupWeights | None = None
-        self._kernel: CausalBits | BitTables | None = None
-        self._tables: BitTables | None = None
+        self._packed_bits: CausalBits | None = None
+        self._rules: dict[tuple[str, float], BitRules | None] = {}
 
     @one_thread()
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
@@ -183,9 +188,8 @@ class NeuralTransitionModel(NetworkPair):
         """See TransitionModel."""
         keys = as_keys(rng, len(states))
         states, actions = as_rows(states, actions, len(self.cardinalities))
-        if (tables := self.tables()) is not None:
-            drawn = sample_tables(states, actions, keys, tables)
-            return np.ascontiguousarray(drawn[:, :-1]), drawn[:, -1] == 1
+        if (rules := self.rules()) is not None:
+            return sample_rules(states, actions, keys, rules)
         logits, probs = self._predict(states, actions)
         config = self.config
         if config.conditioner is None:
@@ -263,23 +267,27 @@ class NeuralTransitionModel(NetworkPair):
             seed,
         )
 
-    def kernel(self) -> CausalBits | BitTables | None:
-        """The networks, or their tables, for compiled search (see ``compiled_model``); None where neither covers them."""
-        if self._kernel is None and self.config.conditioner == "causal" and isinstance(self.predictor, DensePredictor):
-            bits = self.tables()
-            self._kernel = bits if bits is not None else self._pack_bits(self.predictor)
-        return self._kernel
-
-    def _pack_bits(self, predictor: DensePredictor) -> CausalBits | None:
-        return pack_bits(pack_dense(predictor), self._packed_groups(), self._layout, self.config.certain)
-
-    def tables(self) -> BitTables | None:
-        """A pruned model's truth tables, which it samples and searches with; None where a variable has too many parents left."""
-        if not self.use_tables:
+    def kernel(self) -> CausalBits | BitRules | None:
+        """The networks, or what pruning left of them, for compiled search (see ``compiled_model``); else None."""
+        if self.config.conditioner != "causal" or not isinstance(self.predictor, DensePredictor):
             return None
-        if self._tables is None and len(self._marks) and (pair := self._pair()):
-            self._tables = tabulate(pair, self._marks)
-        return self._tables
+        if (rules := self.rules()) is not None:
+            return rules
+        if self._packed_bits is None:
+            dense = pack_dense(self.predictor)
+            self._packed_bits = pack_bits(dense, self._packed_groups(), self._layout, self.config.certain)
+        return self._packed_bits
+
+    def rules(self) -> BitRules | None:
+        """What is left of a pruned model of bits, which it samples and searches with; None of any other model."""
+        if not len(self._marks) or self.pruned_as == "matrices" or (pair := self._pair()) is None:
+            return None
+        key = (self.pruned_as, self.config.certain)
+        if key not in self._rules:
+            few = tabulable(self._marks) & (self.pruned_as == "tables")
+            networks = pack_sparse(pair.predictor, pair.conditioner, self.config.certain, ~few)
+            self._rules[key] = None if networks is None else compile_rules(tabulate(pair, self._marks, few), networks)
+        return self._rules[key]
 
     def _pair(self) -> Pair | None:
         """The networks, where they can become tables: of bits, single actions, and each bit given those before it, at most."""

@@ -1,4 +1,4 @@
-"""From a pruned predictor and causal conditioner of bits to truth tables (see ``bit_tables.py``).
+"""From a pruned predictor and causal conditioner of bits to truth tables (see ``bit_rules.py``).
 
 What a bit hangs on is what a path of connections leads from and what makes a difference: a bit that always has the same value,
 or whose paths are too weak to matter, is taken for its usual value. How much that changes is measured on transitions.
@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mbagent.models.bit_tables import BitTables
+from mbagent.models.bit_rules import BitTables
 from mbagent.models.networks import ACTIVATIONS, Affine, Conditioner, DensePredictor
 from mbagent.models.training import Examples
 
@@ -27,7 +27,7 @@ TOLERANCE = 0.002
 PARENT = 2
 """Marks a bit that matters; 0 and 1 are values that a bit is taken for."""
 
-ROWS = 1024
+ROWS = 8192
 """Transitions that differences are measured on, at most."""
 
 Marks = NDArray[np.int8]
@@ -103,53 +103,90 @@ def paths(pair: Pair) -> NDArray[np.bool_]:
 @torch.no_grad()
 def find_parents(pair: Pair, rows: Examples) -> Marks:
     """What each outcome bit hangs on: int8 [O, F + O], PARENT or the value that a bit is taken for; of state and outcome."""
-    codec = pair.predictor.codec
-    rows = rows.select(torch.arange(min(ROWS, len(rows))))
+    codec, rows = pair.predictor.codec, rows.spread(ROWS)
     columns = torch.cat((codec.inputs(rows.states, rows.actions), codec.targets(rows.outcomes)), dim=1)
-    usual = (columns.mean(dim=0) > 0.5).float()
-    reach, n_bits = paths(pair), codec.n_state_columns
+    usual, reach, n_bits = (columns.mean(dim=0) > 0.5).float(), paths(pair), codec.n_state_columns
     bits = np.concatenate([np.arange(n_bits), np.arange(codec.n_inputs, columns.shape[1])])
     marks = np.tile(usual.numpy().astype(np.int8)[bits], (len(reach), 1))
-    differs = [torch.nonzero(columns[:, j] != usual[j])[:, 0] for j in range(columns.shape[1])]
+    sample = Sample(columns, usual, rows.weights.double() / rows.weights.sum())
     for i in range(len(reach)):
-        known, matter = chances(pair, columns, i), np.zeros(len(bits))
-        for place in np.flatnonzero(reach[i, bits]):
-            j = bits[place]
-            if len(differs[j]):
-                changed = columns[differs[j]]
-                changed[:, j] = usual[j]
-                matter[place] = float((chances(pair, changed, i) - known[differs[j]]).abs().sum()) / len(columns)
-        order = np.argsort(matter)
-        needed = np.cumsum(matter[order]) > TOLERANCE / len(reach)
-        marks[i, order[needed]] = PARENT
+        places = np.flatnonzero(reach[i, bits])
+        marks[i, places[sample.needed(pair, i, bits[places], TOLERANCE / len(reach))]] = PARENT
     return marks
 
 
+class Sample(NamedTuple):
+    """Transitions that differences are measured on.
+
+    Attributes:
+        columns: of state, action and outcome, [N, n_inputs + O].
+        usual: the value that each of them has most often.
+        weights: of the transitions, double [N], sum 1.
+    """
+
+    columns: Tensor
+    usual: Tensor
+    weights: Tensor
+
+    def needed(self, pair: Pair, i: int, columns: NDArray[np.int64], tolerance: float) -> NDArray[np.int64]:
+        """Places of the columns that outcome bit i hangs on: to take all others for their usual values changes less than this."""
+        known = chances(pair, self.columns, i)
+        alone = np.array([self._changed(pair, i, known, columns[place : place + 1]) for place in range(len(columns))])
+        order, few, many = np.argsort(alone, kind="stable"), 0, int((alone <= tolerance).sum())
+        while few < many:  # how many go together, at most
+            middle = (few + many + 1) // 2
+            if self._changed(pair, i, known, columns[order[:middle]]) <= tolerance:
+                few = middle
+            else:
+                many = middle - 1
+        return order[few:]
+
+    def _changed(self, pair: Pair, i: int, known: Tensor, columns: NDArray[np.int64]) -> float:
+        """How far the chance of bit i moves if these columns are taken for their usual values, mean over transitions."""
+        differs = torch.nonzero((self.columns[:, columns] != self.usual[columns]).any(dim=1))[:, 0]
+        if not len(differs):
+            return 0.0
+        changed = self.columns[differs]
+        changed[:, columns] = self.usual[columns]
+        return float(torch.dot((chances(pair, changed, i) - known[differs]).abs(), self.weights[differs]))
+
+
+def tabulable(marks: Marks) -> NDArray[np.bool_]:
+    """Which outcome bits have few enough parents for a table, bool [O]."""
+    few: NDArray[np.bool_] = (marks == PARENT).sum(axis=1) <= MOST_PARENTS
+    return few
+
+
 @torch.no_grad()
-def tabulate(pair: Pair, marks: Marks) -> BitTables | None:
-    """Tables over what ``marks`` names; None where a bit has more than MOST_PARENTS parents."""
+def tabulate(pair: Pair, marks: Marks, which: NDArray[np.bool_]) -> BitTables:
+    """Tables over what ``marks`` names, of the bits ``which``; all others have an empty one."""
     codec, reach = pair.predictor.codec, paths(pair)
     n_bits, n_actions, n_outputs = codec.n_state_columns, codec.n_actions, len(codec.outputs)
-    if (marks == PARENT).sum(axis=1).max() > MOST_PARENTS:
-        return None
     tables, begin, stride, n_states, parents, first = [], [0], [], [], [], [0]
     for i in range(n_outputs):
-        mine = np.flatnonzero(marks[i] == PARENT)
-        size, acts = 1 << len(mine), bool(reach[i, n_bits : codec.n_inputs].any())
-        fixed = torch.from_numpy(np.where(marks[i] == PARENT, 0, marks[i]).astype(np.float32))
-        columns = torch.zeros(size * n_actions if acts else size, codec.n_inputs + n_outputs)
-        columns[:, :n_bits], columns[:, codec.n_inputs :] = fixed[:n_bits], fixed[n_bits:]
-        number = torch.arange(len(columns))
-        for power, j in enumerate(mine):
-            columns[:, j if j < n_bits else j + n_actions] = (number % size >> power & 1).float()
-        columns[number, n_bits + number // size] = 1.0
-        tables.append(chances(pair, columns, i).numpy())
-        begin.append(begin[-1] + len(columns))
-        stride.append(size if acts else 0)
-        n_states.append(int((mine < n_bits).sum()))
-        parents += [int(j) if j < n_bits else int(j) - n_bits for j in mine]
+        mine, acts = np.flatnonzero(marks[i] == PARENT), bool(reach[i, n_bits : codec.n_inputs].any())
+        if which[i]:
+            tables.append(_table(pair, marks[i], mine, acts, i))
+            parents += [int(j) if j < n_bits else int(j) - n_bits for j in mine]
+        n_states.append(int((mine < n_bits).sum()) if which[i] else 0)
+        stride.append(1 << len(mine) if acts and which[i] else 0)
+        begin.append(sum(map(len, tables)))
         first.append(len(parents))
     ints: Callable[[list[int]], NDArray[np.int64]] = lambda values: np.array(values, dtype=np.int64)  # noqa: E731
-    return BitTables(
-        np.concatenate(tables), ints(begin[:-1]), ints(stride), ints(n_states), ints(parents), ints(first), n_actions
-    )
+    table = np.concatenate(tables) if tables else np.zeros(0)
+    return BitTables(table, ints(begin[:-1]), ints(stride), ints(n_states), ints(parents), ints(first), n_actions)
+
+
+def _table(pair: Pair, marks: Marks, mine: NDArray[np.int64], acts: bool, i: int) -> NDArray[np.float64]:
+    """P(bit i = 1) for each value of its parents ``mine``, and for each action where it ``acts``."""
+    codec = pair.predictor.codec
+    n_bits, n_actions, size = codec.n_state_columns, codec.n_actions, 1 << len(mine)
+    fixed = torch.from_numpy(np.where(marks == PARENT, 0, marks).astype(np.float32))
+    columns = torch.zeros(size * n_actions if acts else size, codec.n_inputs + len(codec.outputs))
+    columns[:, :n_bits], columns[:, codec.n_inputs :] = fixed[:n_bits], fixed[n_bits:]
+    number = torch.arange(len(columns))
+    for power, j in enumerate(mine):
+        columns[:, j if j < n_bits else j + n_actions] = (number % size >> power & 1).float()
+    columns[number, n_bits + number // size] = 1.0
+    table: NDArray[np.float64] = chances(pair, columns, i).numpy()
+    return table

@@ -85,6 +85,10 @@ class Examples:
         """The rows with the given indices."""
         return Examples(self.states[rows], self.actions[rows], self.outcomes[rows], self.weights[rows])
 
+    def spread(self, most: int) -> Examples:
+        """At most so many rows, evenly spread: distinct rows are sorted, and the first ones look alike."""
+        return self.select(torch.linspace(0, len(self) - 1, min(len(self), most)).long()) if len(self) else self
+
 
 def examples(rows: TransitionBatch) -> Examples:
     """Distinct transitions with counts: the paper's P(Y | X) as target, without doing equal rows again and again."""

@@ -101,7 +101,7 @@ def test_compiled_lookahead_is_that_of_any_model() -> None:
 def test_new_weights_make_a_new_kernel() -> None:
     model, _ = trained()
     before = model.kernel()
-    assert before is not None
+    assert isinstance(before, CausalBits)
     assert model.kernel() is before
     assert before.first.any()
     with torch.no_grad():
@@ -109,7 +109,7 @@ def test_new_weights_make_a_new_kernel() -> None:
             parameter.zero_()
     model.load_state_dict(model.state_dict())
     after = model.kernel()
-    assert after is not None
+    assert isinstance(after, CausalBits)
     assert not after.first.any()
 
 

@@ -14,7 +14,7 @@ from scipy import stats
 
 from mbagent.analysis.planning_benchmark.noise import random_inputs
 from mbagent.analysis.planning_benchmark.worlds import Floats, Ints
-from mbagent.models.neural import NeuralTransitionModel
+from mbagent.models.neural import NeuralTransitionModel, PrunedAs
 from mbagent_envs.random_keys import derive
 
 TRUSTED = 0.98
@@ -123,14 +123,14 @@ def naive_sample(model: NeuralTransitionModel, states: Ints, actions: Ints, seed
 
 
 @contextmanager
-def using(model: NeuralTransitionModel, certain: float, sweeps: int) -> Iterator[None]:
-    """The model with other settings of its sampler, and with its networks even where it has truth tables."""
-    config, tables = model.config, model.use_tables
-    model.config, model.use_tables = replace(config, certain=certain, sweeps=sweeps), False
+def using(model: NeuralTransitionModel, certain: float, sweeps: int, pruned_as: PrunedAs = "matrices") -> Iterator[None]:
+    """The model with other settings of its sampler; where it is pruned, drawn from its whole matrices or as told."""
+    before = model.config, model.pruned_as
+    model.config, model.pruned_as = replace(model.config, certain=certain, sweeps=sweeps), pruned_as
     try:
         yield
     finally:
-        model.config, model.use_tables = config, tables
+        model.config, model.pruned_as = before
 
 
 def microseconds(call: Callable[[], object], rows: int, at_least: float = 0.3, repetitions: int = 5) -> float:
