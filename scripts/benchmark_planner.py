@@ -30,7 +30,7 @@ from mbagent.analysis.planning_benchmark.crowds import WORLDS, compare_values
 from mbagent.analysis.planning_benchmark.latency import SETTINGS, steady
 from mbagent.analysis.planning_benchmark.latency import measure as measure_latency
 from mbagent.analysis.planning_benchmark.network_search import EFFORTS, measure_own, ratios, rows_of_mctx
-from mbagent.analysis.planning_benchmark.networks import build_task, run_networks_in_mctx
+from mbagent.analysis.planning_benchmark.networks import build_task, pruned, run_networks_in_mctx
 from mbagent.analysis.planning_benchmark.noise import Sampler, trained
 from mbagent.analysis.planning_benchmark.page import TITLES, shown, write_page
 from mbagent.analysis.planning_benchmark.peers import PeerError
@@ -41,6 +41,9 @@ from mbagent.analysis.planning_benchmark.start import GAMES, first_decisions
 
 Rows = list[dict[str, Any]]
 Say = Callable[[str], None]
+PRUNED = 0.9
+"""Share of the connections that the pruned networks have lost at least."""
+
 PARTS = ("quality", "crowds", "decisions", "start", "memory", "regret", "naive", "short cut", "networks")
 
 
@@ -148,13 +151,14 @@ def measure_short_cut(args: Args, say: Say) -> dict[str, Rows]:
 
 
 def measure_networks(args: Args, say: Say) -> dict[str, Rows]:
-    """Searches through learned networks."""
+    """Searches through learned networks, whole and pruned."""
     say("networks: learning the game")
     task = build_task(args.first_seed)
-    own = []
-    for effort in EFFORTS:
-        say(f"networks: {effort.search}, {effort.simulations} simulations")
-        own.append(measure_own(task, effort))
+    tasks, own = (task, pruned(task, PRUNED, args.first_seed)), []
+    for one in tasks:
+        for effort in EFFORTS:
+            say(f"networks: {effort.of(one)}, {effort.simulations} simulations")
+            own.append(measure_own(one, effort))
     if args.peers_python is None:
         say("Networks in mctx are left out: --peers-python is not given.")
         return {"networks": [asdict(row) for row in own]}
@@ -164,9 +168,10 @@ def measure_networks(args: Args, say: Say) -> dict[str, Rows]:
     except PeerError as error:
         say(f"Left out: {error}")
         return {"networks": [asdict(row) for row in own]}
+    whole, less = own[: len(EFFORTS)], own[len(EFFORTS) :]
     return {
         "networks": [asdict(row) for row in (*own, *peer)],
-        "equal regret": [asdict(row) for row in ratios(own, peer)],
+        "equal regret": [asdict(row) for mine in (whole, less) for row in ratios(mine, peer)],
     }
 
 

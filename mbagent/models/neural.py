@@ -54,7 +54,7 @@ class NeuralTransitionModel(NetworkPair):
         self._forward: CompiledBody | None = None
         self._groups: GroupWeights | None = None
         self._packed_bits: CausalBits | None = None
-        self._rules: dict[tuple[str, float], BitRules | None] = {}
+        self._rules: dict[tuple[str, float], tuple[BitRules | None, BitRules | None]] = {}
 
     @one_thread()
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
@@ -271,23 +271,27 @@ class NeuralTransitionModel(NetworkPair):
         """The networks, or what pruning left of them, for compiled search (see ``compiled_model``); else None."""
         if self.config.conditioner != "causal" or not isinstance(self.predictor, DensePredictor):
             return None
-        if (rules := self.rules()) is not None:
+        if (rules := self.rules(settled=True)) is not None:
             return rules
         if self._packed_bits is None:
             dense = pack_dense(self.predictor)
             self._packed_bits = pack_bits(dense, self._packed_groups(), self._layout, self.config.certain)
         return self._packed_bits
 
-    def rules(self) -> BitRules | None:
-        """What is left of a pruned model of bits, which it samples and searches with; None of any other model."""
+    def rules(self, settled: bool = False) -> BitRules | None:
+        """What is left of a pruned model of bits, which it samples with, or searches with (``settled``); None of any other."""
         if not len(self._marks) or self.pruned_as == "matrices" or (pair := self._pair()) is None:
             return None
         key = (self.pruned_as, self.config.certain)
         if key not in self._rules:
             few = tabulable(self._marks) & (self.pruned_as == "tables")
-            networks = pack_sparse(pair.predictor, pair.conditioner, self.config.certain, ~few)
-            self._rules[key] = None if networks is None else compile_rules(tabulate(pair, self._marks, few), networks)
-        return self._rules[key]
+            networks = None if few.all() else pack_sparse(pair.predictor, pair.conditioner, self.config.certain, ~few)
+            if networks is None and not few.all():
+                self._rules[key] = (None, None)
+            else:
+                left = tabulate(pair, self._marks, few), networks, self.codec.n_actions
+                self._rules[key] = (compile_rules(*left), compile_rules(*left, settled=True))
+        return self._rules[key][settled]
 
     def _pair(self) -> Pair | None:
         """The networks, where they can become tables: of bits, single actions, and each bit given those before it, at most."""

@@ -20,6 +20,9 @@ from mbagent.models.bit_networks import activate
 from mbagent.models.networks import Affine, Conditioner, DensePredictor
 from mbagent_envs._compiled import compiled, inlined
 
+SURE_LOGIT = math.log(1e6)
+"""A logit further from 0 is sure."""
+
 Bools: TypeAlias = NDArray[np.bool_]
 
 
@@ -88,7 +91,7 @@ class SparseNetworks(NamedTuple):
 def pack_sparse(
     predictor: DensePredictor, conditioner: Conditioner | None, certain: float, asked: Bools
 ) -> SparseNetworks | None:
-    """The connections that the bits ``asked`` for need; None where that is any, and the predictor has not one hidden layer.
+    """The connections that the bits ``asked`` for need; None where the predictor has not one hidden layer.
 
     Args:
         predictor: of bits and single actions.
@@ -97,15 +100,11 @@ def pack_sparse(
         asked: bool [O].
     """
     layers = [layer for layer in predictor.layers if isinstance(layer, Affine)]
-    if len(layers) != 1 and asked.any():
+    if len(layers) != 1:
         return None
-    codec = predictor.codec
-    first, bias = np.zeros((0, codec.n_inputs), dtype=np.float32), np.zeros(0, dtype=np.float32)
-    out = np.zeros((len(asked), 0), dtype=np.float32)
-    if asked.any():
-        out = _array(predictor.out.weight) * asked[:, None]
-        needed = np.flatnonzero((out != 0.0).any(axis=0))
-        first, bias, out = _array(layers[0].weight)[needed], _array(layers[0].bias)[needed], out[:, needed]
+    codec, out = predictor.codec, _array(predictor.out.weight) * asked[:, None]
+    needed = np.flatnonzero((out != 0.0).any(axis=0))
+    first, bias, out = _array(layers[0].weight)[needed], _array(layers[0].bias)[needed], out[:, needed]
     stay = np.zeros((codec.n_actions, codec.n_state_columns), dtype=np.float32)
     if predictor.stay is not None:
         stay = _array(predictor.stay)
@@ -149,66 +148,134 @@ def _array(tensor: Tensor) -> Floats32:
     return array
 
 
+class Room(NamedTuple):
+    """Work space.
+
+    Attributes:
+        sums: what the state gives to the hidden nodes, [H].
+        hidden: their values, [H].
+        logits: the predictor's, [O].
+        nodes: values of a group's nodes.
+    """
+
+    sums: Floats32
+    hidden: Floats32
+    logits: Floats
+    nodes: Floats32
+
+
+@compiled
+def room_for(k: SparseNetworks | None) -> Room:
+    """Work space for networks; nothing for none. Numba leaves out at once what is asked of none, here and below."""
+    n_hidden, n_outputs, n_nodes = 0, 0, 0
+    if k is not None:
+        n_hidden, n_outputs, n_nodes = len(k.bias), len(k.asked), len(k.groups.readout)
+    return Room(
+        np.empty(n_hidden, dtype=np.float32),
+        np.empty(n_hidden, dtype=np.float32),
+        np.empty(n_outputs, dtype=np.float64),
+        np.empty(n_nodes, dtype=np.float32),
+    )
+
+
 @inlined
-def add_input(column: int, sums: Floats32, links: Links) -> None:
-    """Adds to the hidden nodes' sums [H] what a state bit that is 1, or an action, gives them."""
-    begin, other, weight = links
+def _add_input(column: int, sums: Floats32, begin: Ints, other: Ints, weight: Floats32) -> None:
+    """Adds what a state bit that is 1, or an action, gives to the hidden nodes' sums [H]."""
     for v in range(begin[column], begin[column + 1]):
         sums[other[v]] += weight[v]
 
 
-@inlined
-def predicted(i: int, hidden: Floats32, begin: Ints, other: Ints, weight: Floats32, logit: float) -> float:
-    """The predictor's logit of outcome bit i, from the hidden nodes' values [H], their links, and what it is without them."""
-    for v in range(begin[i], begin[i + 1]):
-        logit += weight[v] * np.float64(hidden[other[v]])
-    return logit
+@compiled
+def see_state(k: SparseNetworks | None, room: Room, state: Ints) -> None:
+    """Sums up what a state int64 [F] gives to the hidden nodes."""
+    if k is None:
+        return
+    sums, bias = room.sums, k.bias
+    begin, other, weight = k.inputs
+    for h in range(len(sums)):
+        sums[h] = bias[h]
+    for bit in range(len(state)):
+        if state[bit] == 1:
+            _add_input(bit, sums, begin, other, weight)
 
 
 @compiled
-def predict_bits(state: Ints, action: int, hidden: Floats32, bits: Ints, logits: Floats, k: SparseNetworks) -> None:
-    """Writes the predictor's logits [O] of some outcome bits of state int64 [F], from the hidden nodes' values [H]."""
+def see_action(k: SparseNetworks | None, room: Room, state: Ints, action: int) -> None:
+    """Writes the predictor's logits of the bits asked for, after ``see_state``."""
+    if k is None:
+        return
+    sums, hidden, logits, bias, stay, asked = room.sums, room.hidden, room.logits, k.output_bias, k.stay, k.asked
+    begin, other, weight = k.inputs
+    for h in range(len(sums)):
+        hidden[h] = sums[h]
+    _add_input(len(state) + action, hidden, begin, other, weight)
+    activate(hidden, k.activation)
     begin, other, weight = k.outputs
-    bias, stay, asked = k.output_bias, k.stay, k.asked
-    for i in bits:
+    for i in range(len(asked)):
         if asked[i]:
             logit = np.float64(bias[i])
             if i < len(state):
                 logit += stay[action, i] * np.float64(2 * state[i] - 1)
-            logits[i] = predicted(i, hidden, begin, other, weight, logit)
+            for v in range(begin[i], begin[i + 1]):
+                logit += weight[v] * np.float64(hidden[other[v]])
+            logits[i] = logit
+
+
+@inlined
+def _chance(logit: float) -> float:
+    """The logistic function, in double precision; 0 or 1 where it is next to that."""
+    if abs(logit) > SURE_LOGIT:
+        return 1.0 if logit > 0.0 else 0.0
+    return 1.0 / (1.0 + math.exp(-logit))
 
 
 @compiled
-def conditioned(
+def leans_on_open(k: SparseNetworks | None, room: Room, i: int, base: Ints) -> bool:
+    """Whether what the networks say of bit i depends on an outcome bit that is open, -1 in ``base`` int64 [O]."""
+    found = False
+    if k is None:
+        return found
+    n_inputs, group = len(k.inputs.begin) - 1, k.groups.begin
+    if k.groups.grouped[i] and abs(room.logits[i]) < k.certain:
+        begin, other, _ = k.groups.links
+        for v in range(begin[group[i]], begin[group[i + 1]]):
+            found = found or (other[v] >= n_inputs and base[other[v] - n_inputs] < 0)
+    return found
+
+
+@compiled
+def ask(
+    k: SparseNetworks | None,
+    room: Room,
     i: int,
-    prior: float,
     action: int,
     q: int,
     state: Ints,
     base: Ints,
     slot: Ints,
     factors: Ints,
-    nodes: Floats32,
-    k: SparseNetworks,
 ) -> float:
-    """The logit of bit i in the eyes of its group, given the outcome bits before it.
+    """P(bit i = 1) in the eyes of a particle that knows the outcome bits before it, after ``see_action``.
 
     Args:
+        k: the networks.
+        room: work space.
         i: the bit.
-        prior: the predictor's logit.
         action: taken.
         q: the particle that knows the open bits.
         state: bits, int64 [F].
         base: of the outcome, -1 where open, int64 [O].
         slot: the number of each open bit among them, int64 [O].
         factors: values of the open bits, int64 [n, O].
-        nodes: work space, float32, for the group's nodes.
-        k: the networks.
     """
-    n_bits, n_inputs, groups = len(state), len(k.inputs.begin) - 1, k.groups
-    first, last = groups.begin[i], groups.begin[i + 1]
+    if k is None:
+        return 0.5
+    logit, groups, nodes = room.logits[i], k.groups, room.nodes
+    if not groups.grouped[i] or abs(logit) >= k.certain:
+        return _chance(logit)
+    n_bits, n_inputs = len(state), len(k.inputs.begin) - 1
+    first, last, readout, bias = groups.begin[i], groups.begin[i + 1], groups.readout, groups.bias
     begin, other, weight = groups.links
-    bias, readout = groups.bias, groups.readout
     for node in range(first, last):
         total = bias[node]
         for v in range(begin[node], begin[node + 1]):
@@ -224,18 +291,7 @@ def conditioned(
             total += weight[v] * np.float32(value)
         nodes[node - first] = total
     activate(nodes[: last - first], k.activation)
-    logit = np.float64(groups.offset[i]) + (prior if groups.correction else 0.0)
+    own = np.float64(groups.offset[i]) + (logit if groups.correction else 0.0)
     for node in range(first, last):
-        logit += readout[node] * np.float64(nodes[node - first])
-    return logit
-
-
-@inlined
-def leans_on_open(i: int, base: Ints, k: SparseNetworks) -> bool:
-    """Whether the group of bit i sees an outcome bit that is open."""
-    n_inputs, group = len(k.inputs.begin) - 1, k.groups.begin
-    begin, other, _ = k.groups.links
-    found = False
-    for v in range(begin[group[i]], begin[group[i + 1]]):
-        found = found or (other[v] >= n_inputs and base[other[v] - n_inputs] < 0)
-    return found
+        own += readout[node] * np.float64(nodes[node - first])
+    return _chance(own)

@@ -6,7 +6,6 @@ or whose paths are too weak to matter, is taken for its usual value. How much th
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mbagent.models.bit_rules import BitTables
+from mbagent.models.bit_rules import Table
 from mbagent.models.networks import ACTIVATIONS, Affine, Conditioner, DensePredictor
 from mbagent.models.training import Examples
 
@@ -158,28 +157,16 @@ def tabulable(marks: Marks) -> NDArray[np.bool_]:
 
 
 @torch.no_grad()
-def tabulate(pair: Pair, marks: Marks, which: NDArray[np.bool_]) -> BitTables:
-    """Tables over what ``marks`` names, of the bits ``which``; all others have an empty one."""
+def tabulate(pair: Pair, marks: Marks, which: NDArray[np.bool_]) -> list[Table | None]:
+    """Tables over what ``marks`` names, of the bits ``which``; None for all others."""
     codec, reach = pair.predictor.codec, paths(pair)
-    n_bits, n_actions, n_outputs = codec.n_state_columns, codec.n_actions, len(codec.outputs)
-    tables, begin, stride, n_states, parents, first = [], [0], [], [], [], [0]
-    for i in range(n_outputs):
-        mine, acts = np.flatnonzero(marks[i] == PARENT), bool(reach[i, n_bits : codec.n_inputs].any())
-        if which[i]:
-            tables.append(_table(pair, marks[i], mine, acts, i))
-            parents += [int(j) if j < n_bits else int(j) - n_bits for j in mine]
-        n_states.append(int((mine < n_bits).sum()) if which[i] else 0)
-        stride.append(1 << len(mine) if acts and which[i] else 0)
-        begin.append(sum(map(len, tables)))
-        first.append(len(parents))
-    ints: Callable[[list[int]], NDArray[np.int64]] = lambda values: np.array(values, dtype=np.int64)  # noqa: E731
-    table = np.concatenate(tables) if tables else np.zeros(0)
-    return BitTables(table, ints(begin[:-1]), ints(stride), ints(n_states), ints(parents), ints(first), n_actions)
+    acts = [bool(row[codec.n_state_columns : codec.n_inputs].any()) for row in reach]
+    return [_table(pair, marks[i], acts[i], i) if which[i] else None for i in range(len(marks))]
 
 
-def _table(pair: Pair, marks: Marks, mine: NDArray[np.int64], acts: bool, i: int) -> NDArray[np.float64]:
-    """P(bit i = 1) for each value of its parents ``mine``, and for each action where it ``acts``."""
-    codec = pair.predictor.codec
+def _table(pair: Pair, marks: Marks, acts: bool, i: int) -> Table:
+    """P(bit i = 1) for each value of its parents, and for each action where it ``acts``."""
+    codec, mine = pair.predictor.codec, np.flatnonzero(marks == PARENT)
     n_bits, n_actions, size = codec.n_state_columns, codec.n_actions, 1 << len(mine)
     fixed = torch.from_numpy(np.where(marks == PARENT, 0, marks).astype(np.float32))
     columns = torch.zeros(size * n_actions if acts else size, codec.n_inputs + len(codec.outputs))
@@ -188,5 +175,5 @@ def _table(pair: Pair, marks: Marks, mine: NDArray[np.int64], acts: bool, i: int
     for power, j in enumerate(mine):
         columns[:, j if j < n_bits else j + n_actions] = (number % size >> power & 1).float()
     columns[number, n_bits + number // size] = 1.0
-    table: NDArray[np.float64] = chances(pair, columns, i).numpy()
-    return table
+    table: NDArray[np.float64] = chances(pair, columns, i).numpy().reshape(-1, *(2,) * len(mine))
+    return Table(tuple(mine[mine < n_bits].tolist()), tuple((mine[mine >= n_bits] - n_bits).tolist()), table)

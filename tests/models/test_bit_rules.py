@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from mbagent.models.bit_rules import BitRules
+from mbagent.models.bit_rules import BitRules, Table, compile_rules
 from mbagent.models.neural import NeuralTransitionModel, PrunedAs
 from mbagent.models.pruning import PruningConfig
 from mbagent.models.state_graph import StateGraph
@@ -38,7 +38,9 @@ def few_tables(model: NeuralTransitionModel, monkeypatch: pytest.MonkeyPatch) ->
     model.pruned_as = "tables"
     rules = model.rules()
     assert rules is not None
+    assert rules.networks is not None
     assert 0 < rules.networks.asked.sum() < N_BITS + 1
+    assert (rules.bits[:, 1] < 0).sum() == rules.networks.asked.sum()
     return rules
 
 
@@ -51,7 +53,9 @@ def drawn(model: NeuralTransitionModel, pruned_as: PrunedAs) -> np.ndarray:
 def test_draws_are_those_of_the_matrices(pruned: NeuralTransitionModel, monkeypatch: pytest.MonkeyPatch) -> None:
     rules = pruned.rules()
     assert rules is not None
-    assert np.diff(rules.tables.first).max() <= MOST_PARENTS
+    assert rules.networks is None
+    assert (rules.bits[:, 5] - rules.bits[:, 3]).max() <= MOST_PARENTS
+    assert sorted([*rules.bits[:, 0], *rules.copies[:, 0]]) == list(range(N_BITS + 1))
     theirs = drawn(pruned, "matrices")
     assert (drawn(pruned, "tables") != theirs).any(axis=1).mean() <= 0.005
     assert np.array_equal(drawn(pruned, "connections"), theirs)  # equal but for rounding
@@ -63,6 +67,7 @@ def test_connections_are_as_many_as_are_left(pruned: NeuralTransitionModel) -> N
     pruned.pruned_as = "connections"
     rules, left = pruned.rules(), pruned.connections()
     assert rules is not None
+    assert rules.networks is not None
     assert rules.networks.asked.all()
     assert len(rules.networks.inputs.weight) + len(rules.networks.outputs.weight) <= left["predictor"].left
     groups = rules.networks.groups
@@ -76,8 +81,8 @@ def test_tables_survive_saving(pruned: NeuralTransitionModel) -> None:
     first, second = pruned.rules(), other.rules()
     assert first is not None
     assert second is not None
-    for name in first.tables._fields:
-        assert np.array_equal(getattr(first.tables, name), getattr(second.tables, name))
+    for name in ("table", "bits", "parents", "copies"):
+        assert np.array_equal(getattr(first, name), getattr(second, name))
 
 
 @pytest.mark.parametrize("pruned_as", ["tables", "mixed", "connections"])
@@ -100,3 +105,27 @@ def test_compiled_search_imagines_the_same(
         found.append({(int(s), int(a), y): float(p) for (s, a, y), p in zip(keys, graph.probabilities[rows], strict=True)})
     apart = sum(abs(found[0].get(key, 0.0) - found[1].get(key, 0.0)) for key in set(found[0]) | set(found[1]))
     assert 0.5 * apart / (len(states) * pruned.n_actions) <= 0.005
+
+
+def test_tables_lose_what_makes_no_difference() -> None:
+    chances = np.array([[[0.0, 0.0], [1.0, 1.0]]] * 3)  # [action, the outcome's bit 4, the state's bit 2]
+    plain = Table((2,), (4,), chances).simplified(chances)
+    assert (plain.states, plain.others, plain.chances.tolist()) == ((), (4,), [[0.0, 1.0]])
+    alone = Table((2,), (4,), chances).simplified(np.swapaxes(chances, 1, 2))
+    assert (alone.states, alone.others, alone.chances.tolist()) == ((2,), (), [[0.0, 1.0]])
+    nothing = Table((2,), (4,), chances).simplified(np.full((3, 2, 2), 0.5))
+    assert (nothing.states, nothing.others, nothing.chances.tolist()) == ((), (), [0.5])
+
+
+def test_improbable_values_are_taken_for_impossible() -> None:
+    tables = [
+        Table((0,), (), np.array([[1e-5, 1.0 - 1e-5]])),
+        Table((), (), np.array([0.005])),
+        Table((), (0,), np.array([[0.1, 1.0]])),
+    ]
+    rules = compile_rules(tables, None, 2)
+    assert rules.copies.tolist() == [[0, 0, 0, 1]]
+    assert rules.bits[:, 0].tolist() == [1, 2]
+    assert rules.table.tolist() == [0.005, 0.1, 1.0]
+    settled = compile_rules(tables, None, 2, settled=True)  # as search sees them
+    assert settled.copies.tolist() == [[0, 0, 0, 1], [1, 0, 0, 0]]

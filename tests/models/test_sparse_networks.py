@@ -7,7 +7,7 @@ import torch
 from mbagent.models.config import NeuralConfig
 from mbagent.models.networks import DensePredictor
 from mbagent.models.neural import NeuralTransitionModel
-from mbagent.models.sparse_networks import add_input, conditioned, leans_on_open, pack_sparse, predict_bits
+from mbagent.models.sparse_networks import ask, leans_on_open, pack_sparse, room_for, see_action, see_state
 from mbagent.models.tabulate import Pair, chances
 
 N_BITS, N_ACTIONS, N_OUT = 5, 3, 6
@@ -27,31 +27,23 @@ def thinned(hidden: tuple[int, ...] = (16,), seed: int = 0) -> NeuralTransitionM
     return model
 
 
-def test_logits_are_those_of_the_modules() -> None:
+def test_chances_are_those_of_the_modules() -> None:
     model = thinned()
     assert isinstance(model.predictor, DensePredictor)
-    asked = np.ones(N_OUT, dtype=np.bool_)
-    k = pack_sparse(model.predictor, model.conditioner, 1.0, asked)
-    assert k is not None
-    rng = np.random.default_rng(1)
-    pair = Pair(model.predictor, model.conditioner, 2.0)
+    k, plain = (pack_sparse(model.predictor, c, 1.0, np.ones(N_OUT, dtype=np.bool_)) for c in (model.conditioner, None))
+    pairs, rng = [Pair(model.predictor, c, 2.0) for c in (model.conditioner, None)], np.random.default_rng(1)
+    none = np.zeros((1, 1), dtype=np.int64)
     for _ in range(20):
         state, action, outcome = rng.integers(2, size=N_BITS), int(rng.integers(N_ACTIONS)), rng.integers(2, size=N_OUT)
-        hidden = k.bias.copy()
-        for bit in np.flatnonzero(state).tolist():
-            add_input(bit, hidden, k.inputs)
-        add_input(N_BITS + action, hidden, k.inputs)
-        hidden, logits = np.tanh(hidden), np.zeros(N_OUT)
-        predict_bits(state, action, hidden, np.arange(N_OUT), logits, k)
-        with torch.no_grad():
-            given = model.predictor(torch.from_numpy(state)[None], torch.tensor([action]))[0, :, 1]
-            columns = torch.from_numpy(np.concatenate([state, np.eye(N_ACTIONS)[action], outcome]).astype(np.float32))[None]
-            expected = [float(chances(pair, columns, i)) for i in range(N_OUT)]
-        assert np.allclose(logits, given.numpy(), atol=1e-5)
-        nodes, none = np.zeros(len(k.groups.readout), dtype=np.float32), np.zeros((1, 1), dtype=np.int64)
-        for i in np.flatnonzero(k.groups.grouped).tolist():
-            logit = conditioned(i, logits[i], action, 0, state, outcome, none[0], none, nodes, k)
-            assert 1.0 / (1.0 + np.exp(-logit)) == pytest.approx(expected[i], abs=1e-5)
+        columns = torch.from_numpy(np.concatenate([state, np.eye(N_ACTIONS)[action], outcome]).astype(np.float32))[None]
+        for networks, pair in zip((k, plain), pairs, strict=True):
+            room = room_for(networks)
+            see_state(networks, room, state)
+            see_action(networks, room, state, action)
+            with torch.no_grad():
+                expected = [float(chances(pair, columns, i)) for i in range(N_OUT)]
+            ours = [ask(networks, room, i, action, 0, state, outcome, none[0], none) for i in range(N_OUT)]
+            assert ours == pytest.approx(expected, abs=1e-5)
 
 
 def test_only_what_the_bits_asked_for_need_is_there() -> None:
@@ -71,22 +63,21 @@ def test_only_what_the_bits_asked_for_need_is_there() -> None:
 def test_an_open_bit_is_seen_only_by_groups_that_are_connected_to_it() -> None:
     model = thinned()
     assert isinstance(model.predictor, DensePredictor)
-    k = pack_sparse(model.predictor, model.conditioner, 0.99, np.ones(N_OUT, dtype=np.bool_))
+    k = pack_sparse(model.predictor, model.conditioner, 1.0, np.ones(N_OUT, dtype=np.bool_))
     assert k is not None
-    n_inputs = N_BITS + N_ACTIONS
+    room, state, n_inputs = room_for(k), np.zeros(N_BITS, dtype=np.int64), N_BITS + N_ACTIONS
+    see_state(k, room, state)
+    see_action(k, room, state, 0)
     begin, other, _ = k.groups.links
     for i in range(N_OUT):
         seen = set(other[begin[k.groups.begin[i]] : begin[k.groups.begin[i + 1]]].tolist())
         for j in range(N_OUT):
             base = np.zeros(N_OUT, dtype=np.int64)
             base[j] = -1
-            assert leans_on_open(i, base, k) == (n_inputs + j in seen)
+            assert leans_on_open(k, room, i, base) == (n_inputs + j in seen)
 
 
-def test_several_hidden_layers_are_not_covered_unless_nothing_is_asked_of_them() -> None:
+def test_several_hidden_layers_are_not_covered() -> None:
     model = thinned((8, 8))
     assert isinstance(model.predictor, DensePredictor)
     assert pack_sparse(model.predictor, model.conditioner, 0.99, np.ones(N_OUT, dtype=np.bool_)) is None
-    nothing = pack_sparse(model.predictor, model.conditioner, 0.99, np.zeros(N_OUT, dtype=np.bool_))
-    assert nothing is not None
-    assert not len(nothing.bias) + len(nothing.groups.readout)

@@ -31,10 +31,10 @@ class Effort(NamedTuple):
     lookahead_samples: int
     simulations: int
 
-    @property
-    def search(self) -> str:
+    def of(self, task: NetworkTask) -> str:
         """What the search is called."""
-        return f"mbagent, {self.lookahead_states} states, {self.lookahead_samples} draws"
+        pruned = ", pruned" if task.pruned else ""
+        return f"mbagent{pruned}, {self.lookahead_states} states, {self.lookahead_samples} draws"
 
 
 EFFORTS = (
@@ -150,7 +150,7 @@ def measure_own(task: NetworkTask, effort: Effort, repetitions: int = 5) -> Netw
     (one, drawn), (many, drawn_by_many) = (_timed(task, effort, n_roots, repetitions) for n_roots in AT_ONCE)
     n, roots = effort.simulations, AT_ONCE[1]
     speeds = n / one, roots * n / many, drawn / one, drawn_by_many / many
-    return NetworkRow(effort.search, n, *_shares(task, chosen), 1e3 * one, 1e3 * many / roots, *speeds)
+    return NetworkRow(effort.of(task), n, *_shares(task, chosen), 1e3 * one, 1e3 * many / roots, *speeds)
 
 
 def rows_of_mctx(task: NetworkTask, found: PeerOnNetworks) -> list[NetworkRow]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -60,20 +60,24 @@ class NetworkTask:
     """A learned game, and what is wanted in it.
 
     Attributes:
-        model: predictor and causal conditioner, trained.
+        data: random play in it.
+        model: predictor and causal conditioner, trained on that.
         goals: the game's own reward, and random ones.
         q: exact values of the actions in the starts under each goal, in the true game, [goals, N_STARTS, A].
         starts: states to choose an action in, int64 [N_STARTS, F].
         roots: states of random play to time searches from, int64 [R, F].
         gamma: discount of a step; leaves are worth 0.
+        pruned: whether the model is.
     """
 
+    data: TransitionDataset
     model: NeuralTransitionModel
     goals: tuple[PairwiseGoal, ...]
     q: Floats
     starts: Ints
     roots: Ints
     gamma: float = 0.95
+    pruned: bool = False
 
     def regrets(self, goal: int, actions: Ints) -> float:
         """Mean loss of ``actions`` [..., N_STARTS] under a goal, as a share of what random actions lose there."""
@@ -143,7 +147,15 @@ def build_task(seed: int, n_steps: int = 5000) -> NetworkTask:
         states, q = exact_values(goal, NetworkTask.gamma)
         place = {state.tobytes(): i for i, state in enumerate(states)}
         values.append(q[[place[state.tobytes()] for state in starts]])
-    return NetworkTask(model, goals, np.stack(values), starts, met[:: max(1, len(met) // 16)][:16])
+    return NetworkTask(data, model, goals, np.stack(values), starts, met[:: max(1, len(met) // 16)][:16])
+
+
+def pruned(task: NetworkTask, fraction: float, seed: int) -> NetworkTask:
+    """The same task with the model pruned; the given one keeps its own."""
+    model = NeuralTransitionModel(task.data.cardinalities, task.data.n_actions)
+    model.load_state_dict(task.model.state_dict())
+    model.prune(task.data, fraction, seed=seed)
+    return replace(task, model=model, pruned=True)
 
 
 def exported(task: NetworkTask) -> dict[str, NDArray[np.generic]]:

@@ -26,7 +26,14 @@ def untrained_task() -> NetworkTask:
     solved = [exact_values(goal, NetworkTask.gamma) for goal in goals]
     states = solved[0][0][[0, 95, 199]]
     model = NeuralTransitionModel((2,) * (WIDTH + HALF), 3)
-    return NetworkTask(model, goals, np.stack([q[[0, 95, 199]] for _, q in solved]), states, states)
+    return NetworkTask(
+        random_play(GeyserRunner(width=WIDTH, hit_cost=HIT_COST), 100, 0),
+        model,
+        goals,
+        np.stack([q[[0, 95, 199]] for _, q in solved]),
+        states,
+        states,
+    )
 
 
 def test_the_first_goal_is_the_games_own() -> None:
