@@ -22,8 +22,12 @@ from rich.console import Console
 
 from mbagent.analysis.folders import check_run, open_folder, write_csv
 from mbagent.analysis.parallel import run_all
-from mbagent.analysis.pruning.experiment import FRACTIONS, GAMES, Networks, Outcome, Settings, plan, run_task
+from mbagent.analysis.pruning.experiment import FRACTIONS, GAMES, Networks, Outcome, Settings, Way, plan, run_task
+from mbagent.analysis.pruning.measures import measure_size
 from mbagent.analysis.pruning.page import write_page
+
+SIZES = (16, 32, 64, 128)
+"""Numbers of variables."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,10 @@ class Args:
     """Which games; by default flier_catcher, with --full geyser_high_cost and maneuverer, too."""
     fractions: tuple[float, ...] = FRACTIONS
     """Shares of the connections to remove."""
+    ways: tuple[Way, ...] = Settings.ways
+    """Just the smallest weights, or also what the transitions do not call for."""
+    sizes: tuple[int, ...] | None = None
+    """Numbers of variables to time worlds of; by default none, with --full 16, 32, 64 and 128."""
     networks: Networks = "causal"
     """The default networks, or the paper's own (much slower), both on flat variables."""
     timesteps: int = Settings.timesteps
@@ -57,6 +65,7 @@ def settings_of(args: Args) -> Settings:
     return Settings(
         games=args.games if args.games is not None else GAMES if args.full else GAMES[:1],
         fractions=tuple(sorted(set(args.fractions))),
+        ways=args.ways,
         networks=args.networks,
         timesteps=args.timesteps,
         seeds=args.seeds if args.seeds is not None else 5 if args.full else 1,
@@ -76,6 +85,10 @@ def main(argv: list[str] | None = None) -> int:
         console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
         return 1
     open_folder(args.output, console)
+    sizes = args.sizes if args.sizes is not None else SIZES if args.full else ()
+    costs = [measure_size(d, settings.first_seed + i) for d in sizes for i in range(min(settings.seeds, 3))]
+    if costs:
+        write_csv(args.output / "sizes.csv", [row._asdict() for row in costs])
     outcomes: list[Outcome] = []
     command = shlex.join(["python", "scripts/pruning.py", *(sys.argv[1:] if argv is None else argv)])
     work = run_all(
@@ -84,7 +97,7 @@ def main(argv: list[str] | None = None) -> int:
     for outcome in work:
         outcomes.append(outcome)
         write_csv(args.output / "results.csv", [asdict(row) for o in outcomes for row in o.rows])
-        for name, png in write_page(args.output / "report.html", outcomes, settings, command).items():
+        for name, png in write_page(args.output / "report.html", outcomes, settings, command, costs).items():
             (args.output / f"{name}.png").write_bytes(png)
     console.print(f"Wrote report.html, results.csv and the figures to {args.output}.")
     return 0

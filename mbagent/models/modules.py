@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from mbagent.models.network_pair import NetworkPair
 from mbagent.models.networks import Affine, Conditioner, DensePredictor
-from mbagent.models.neural import NeuralTransitionModel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -59,7 +59,7 @@ class Module:
         return f"{', '.join(names[i] for i in self.outputs)} <- {', '.join(given) or 'nothing'}"
 
 
-def influence(model: NeuralTransitionModel) -> Influence:
+def influence(model: NetworkPair) -> Influence:
     """The sums over paths of both networks.
 
     Raises:

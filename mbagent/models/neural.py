@@ -24,6 +24,7 @@ from mbagent.models.base import (
 from mbagent.models.bit_networks import CausalBits, pack_bits
 from mbagent.models.bit_rules import BitRules, compile_rules, sample_rules
 from mbagent.models.kernels import GroupWeights
+from mbagent.models.modules import Module, dependent_groups, influence, modules
 from mbagent.models.network_pair import NO_MARKS, NetworkPair
 from mbagent.models.networks import DensePredictor
 from mbagent.models.packing import CompiledBody, as_rows, compiled_body, pack_dense, pack_groups
@@ -292,6 +293,18 @@ class NeuralTransitionModel(NetworkPair):
                 left = tabulate(pair, self._marks, few), networks, self.codec.n_actions
                 self._rules[key] = (compile_rules(*left), compile_rules(*left, settled=True))
         return self._rules[key][settled]
+
+    def modules(self) -> list[Module]:
+        """The sets of variables that fall apart into models of their own (paper section 5), largest first; see ``modules``.
+
+        Raises:
+            ValueError: weights are shared over positions, or the predictor is not a dense one.
+        """
+        return modules(influence(self))
+
+    def dependent_groups(self) -> list[Module]:
+        """The sets of variables that are drawn together, given state and action; as ``modules``."""
+        return dependent_groups(influence(self))
 
     def _pair(self) -> Pair | None:
         """The networks, where they can become tables: of bits, single actions, and each bit given those before it, at most."""

@@ -43,6 +43,7 @@ EFFORTS = (
     Effort(8, 1, 16),
     Effort(16, 1, 64),
     Effort(64, 1, 64),
+    Effort(32, 1, 1024),
     Effort(64, 4, 1024),
     Effort(160, 4, 1024),
 )

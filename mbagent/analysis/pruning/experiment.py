@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 import mbagent
 from mbagent.analysis.cases import Case, Scale, find_case, game_of, measure_scale, play
-from mbagent.analysis.planning_benchmark.sampling import EVERYTHING, microseconds, using
-from mbagent.analysis.pruning.truth import Agreement, agreement
+from mbagent.analysis.pruning.measures import excess, marginal_error, measure_others, measure_speeds, unseen_play
+from mbagent.analysis.pruning.truth import agreement
+from mbagent.models.arithmetic import Floats
 from mbagent.models.config import NeuralConfig
 from mbagent.models.modules import Influence, dependent_groups, influence, modules
 from mbagent.models.neural import NeuralTransitionModel
-from mbagent.models.simulator import SimulatorModel
+from mbagent.models.pruning import PruningConfig
 from mbagent.spaces import ActionEnumeration, FactoredSpace
-from mbagent_envs.random_keys import derive
 
-Networks = Literal["causal", "paper"]
+Networks: TypeAlias = Literal["causal", "paper"]
 """The default networks, or the paper's own: both on flat variables."""
+
+Way: TypeAlias = Literal["by size", "by evidence"]
+"""The smallest weights alone, as in the paper; or also what the transitions do not call for, the default."""
+
+Key: TypeAlias = tuple[float, Way]
+"""Share of the connections to remove, and how."""
 
 GAMES = ("flier_catcher", "geyser_high_cost", "maneuverer")
 FRACTIONS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99)
@@ -33,6 +38,7 @@ class Settings:
     Attributes:
         games: keys of ``cases``.
         fractions: shares of the connections to remove.
+        ways: see Way.
         networks: see Networks.
         timesteps: steps of random play to learn from.
         seeds: number of repetitions.
@@ -45,6 +51,7 @@ class Settings:
 
     games: tuple[str, ...] = GAMES[:1]
     fractions: tuple[float, ...] = FRACTIONS
+    ways: tuple[Way, ...] = ("by size", "by evidence")
     networks: Networks = "causal"
     timesteps: int = 20_000
     seeds: int = 1
@@ -58,6 +65,8 @@ class Settings:
                 raise ValueError(f"{key} is none of this package's games, which have exact rules to compare with.")
         if not self.fractions or not all(0.0 <= fraction < 1.0 for fraction in self.fractions):
             raise ValueError(f"Shares of connections to remove are numbers from 0 up to but not 1, got {list(self.fractions)}.")
+        if not self.ways:
+            raise ValueError("Name at least one way to prune: 'by size' or 'by evidence'.")
         for name, least in (("timesteps", 100), ("seeds", 1), ("episodes", 0), ("first_seed", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}.")
@@ -65,37 +74,44 @@ class Settings:
 
 @dataclass(frozen=True)
 class Row:
-    """One agent, pruned to one share.
+    """One agent, pruned to one share in one way.
 
     Attributes:
-        game, seed, fraction: which.
+        game, seed, fraction, way: which; the share 0 stands for the agent before pruning.
         connections: that are left.
+        gone: share of the connections that are gone.
         returned: normalised return; nan where none was played.
         log_likelihood: excess nats a transition over the true model's, on play that was not learned from; nan where the true
             one has none.
         marginal: total variation of single variables from the true ones, mean over variables and inputs.
-        full: microseconds of processor time of a sampled next state, every variable asked of the conditioner.
-        short: the same as ``sample`` does it, without what the predictor is sure of.
+        full, matrices, connected, used, variation: see ``measures.Speeds``.
         parents: state variables that lead to a variable, mean.
         precision, recall: of the connections from state to next state that are left; nan where the truth is not written down.
         conditions_precision, conditions_recall: of those between next variables.
+        modules: share of the true modules, and groups of dependent variables, that are found exactly.
         seconds: of pruning and training.
     """
 
     game: str
     seed: int
     fraction: float
+    way: Way
     connections: int
+    gone: float
     returned: float
     log_likelihood: float
     marginal: float
     full: float
-    short: float
+    matrices: float
+    connected: float
+    used: float
+    variation: float
     parents: float
     precision: float
     recall: float
     conditions_precision: float
     conditions_recall: float
+    modules: float
     seconds: float
 
 
@@ -116,18 +132,22 @@ class Outcome:
         task: which.
         names: of the state variables.
         actions: names of the actions.
-        rows: one for each share.
-        influences: by share.
-        modules, groups: a line for each module and each group of dependent variables, by share.
+        rows: one for each share and way.
+        returns: normalised return of each episode, the same episodes in each.
+        influences: sums over paths.
+        modules, groups: a line for each module and each group of dependent variables.
+        others: microseconds of a next state by other networks, see ``measures.measure_others``.
     """
 
     task: Task
     names: tuple[str, ...]
     actions: tuple[str, ...]
-    rows: list[Row]
-    influences: dict[float, Influence]
-    modules: dict[float, list[str]]
-    groups: dict[float, list[str]]
+    rows: list[Row] = field(default_factory=list)
+    returns: dict[Key, Floats] = field(default_factory=dict)
+    influences: dict[Key, Influence] = field(default_factory=dict)
+    modules: dict[Key, list[str]] = field(default_factory=dict)
+    groups: dict[Key, list[str]] = field(default_factory=dict)
+    others: dict[str, float] = field(default_factory=dict)
 
 
 def plan(settings: Settings) -> list[Task]:
@@ -137,7 +157,7 @@ def plan(settings: Settings) -> list[Task]:
 
 
 def run_task(task: Task) -> Outcome:
-    """Learns once, and prunes the same learned agent to each share."""
+    """Learns once, and prunes the same learned agent to each share in each way."""
     case = find_case(task.game)
     env, settings = case.make_env(), task.settings
     space, n_actions = FactoredSpace(env.observation_space), ActionEnumeration(env.action_space).n
@@ -148,89 +168,52 @@ def run_task(task: Task) -> Outcome:
     learned, scale = agent.get_parameters(), measure_scale(case) if settings.episodes else Scale(0.0, 1.0)
     game = game_of(case)
     assert game is not None
-    outcome = Outcome(task, tuple(space.names), game.action_names, [], {}, {}, {})
+    outcome = Outcome(task, tuple(space.names), game.action_names)
+    outcome.others.update(measure_others(model, *unseen_play(case, task.seed)[:2], task.seed))
     for fraction in settings.fractions:
-        agent.set_parameters(learned)
-        if fraction > 0.0:
-            agent.prune(fraction)
-        found = influence(model)
-        outcome.rows.append(measure(task, case, scale, agent, model, fraction, agreement(game, found)))
-        outcome.influences[fraction] = found
-        outcome.modules[fraction] = [module.text(space.names) for module in modules(found)]
-        outcome.groups[fraction] = [module.text(space.names) for module in dependent_groups(found)]
+        for way in settings.ways if fraction > 0.0 else settings.ways[:1]:
+            agent.set_parameters(learned)
+            if fraction > 0.0:
+                agent.prune(fraction, config=PruningConfig(evidence=way == "by evidence"))
+            _measure((fraction, way), case, scale, agent, model, outcome)
     return outcome
 
 
-def measure(
-    task: Task,
-    case: Case,
-    scale: Scale,
-    agent: mbagent.ModelLearningAgent,
-    model: NeuralTransitionModel,
-    fraction: float,
-    dependencies: Agreement,
-) -> Row:
-    """Everything about one pruned agent."""
-    settings, returned, report = task.settings, float("nan"), agent.fit_report
-    if settings.episodes:
-        policy = lambda obs: agent.predict(obs, deterministic=True)[0]  # noqa: E731
-        returns = play(case, policy, episodes=settings.episodes, seed=task.seed, repeatable=True).default
-        returned = float((returns.mean() - scale.random) / (scale.reference - scale.random))
+def _measure(
+    key: Key, case: Case, scale: Scale, agent: mbagent.ModelLearningAgent, model: NeuralTransitionModel, outcome: Outcome
+) -> None:
+    """Everything about one pruned agent, added to the outcome."""
+    task, report, found, game = outcome.task, agent.fit_report, influence(model), game_of(case)
+    assert game is not None
+    outcome.returns[key] = _play(task, case, scale, agent)
     states, actions, following = unseen_play(case, task.seed)
-    keys = derive(task.seed, np.arange(1024))
-    call = partial(model.sample, states[:1024], actions[:1024], keys)
-    with using(model, EVERYTHING, model.config.sweeps):
-        full = microseconds(call, 1024)
-    return Row(
+    connections = model.connections().values()
+    left, possible = sum(part.left for part in connections), sum(part.total for part in connections)
+    row = Row(
         task.game,
         task.seed,
-        fraction,
-        sum(part.left for part in model.connections().values()),
-        returned,
+        *key,
+        left,
+        1.0 - left / possible,
+        float(outcome.returns[key].mean()) if len(outcome.returns[key]) else float("nan"),
         excess(case, model, states, actions, following),
         marginal_error(case, model, states[:300], actions[:300]),
-        full,
-        microseconds(call, 1024),
-        *dependencies,
+        *measure_speeds(model, np.tile(states, (10, 1)), np.tile(actions, 10), task.seed),
+        *agreement(game, found),
         report.seconds if report is not None else float("nan"),
     )
+    outcome.rows.append(row)
+    outcome.influences[key] = found
+    outcome.modules[key] = [module.text(outcome.names) for module in modules(found)]
+    outcome.groups[key] = [module.text(outcome.names) for module in dependent_groups(found)]
 
 
-def unseen_play(case: Case, seed: int, n: int = 2000) -> tuple[Any, Any, Any]:
-    """States, actions and next states int64 of random play that no agent learns from."""
-    game, rng = game_of(case), np.random.default_rng([seed, 77])
-    assert game is not None
-    obs, rows = game.initial(derive(seed, np.arange(n // 100), 7)), []
-    for step in range(100):
-        actions = rng.integers(len(game.action_names), size=len(obs))
-        after = game.transition(obs, actions, derive(seed, np.arange(len(obs)), 8, step))
-        rows.append((obs.reshape(len(obs), -1), actions, after.reshape(len(obs), -1)))
-        obs = after
-    states, taken, following = (np.concatenate(part).astype(np.int64) for part in zip(*rows, strict=True))
-    return states, taken, following
-
-
-def excess(case: Case, model: NeuralTransitionModel, states: Any, actions: Any, following: Any) -> float:
-    """Nats a transition that the model loses on the true distribution; nan where either has no exact probabilities."""
-    game, alive = game_of(case), np.zeros(len(states), dtype=np.bool_)
-    assert game is not None
-    try:
-        ours = model.log_prob(states, actions, following, alive)
-        obs = states.reshape(-1, *game.observation_space.shape).astype(np.int8)
-        outcomes, chances = game.transition_distributions(obs, actions)
-    except NotImplementedError:
-        return float("nan")
-    same = (outcomes.reshape(*chances.shape, -1) == following[:, None]).all(axis=2)
-    return float((np.log((chances * same).sum(axis=1)) - ours).mean())
-
-
-def marginal_error(case: Case, model: NeuralTransitionModel, states: Any, actions: Any, n_draws: int = 200) -> float:
-    """Total variation of single variables between draws of the model and of the game, mean over inputs and variables."""
-    game = game_of(case)
-    assert game is not None
-    row = np.repeat(np.arange(len(states)), n_draws)
-    means = []
-    for which, one in ((1, model), (2, SimulatorModel(game))):
-        drawn, _ = one.sample(states[row], actions[row], derive(which, np.arange(len(row))))
-        means.append(drawn.reshape(len(states), n_draws, -1).mean(axis=1))
-    return float(np.abs(means[0] - means[1]).mean())
+def _play(task: Task, case: Case, scale: Scale, agent: mbagent.ModelLearningAgent) -> Floats:
+    """Normalised returns of the episodes, the same ones whatever the agent."""
+    episodes = task.settings.episodes
+    if not episodes:
+        return np.zeros(0)
+    policy = lambda obs: agent.predict(obs, deterministic=True)[0]  # noqa: E731
+    returns = play(case, policy, episodes=episodes, seed=task.seed, repeatable=True).default
+    normal: Floats = (returns - scale.random) / (scale.reference - scale.random)
+    return normal

@@ -11,16 +11,19 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mbagent.analysis.cases import find_case
+from mbagent.analysis.cases import find_case, game_of
 from mbagent.analysis.pages import FIGURE_STYLE, render, to_png
-from mbagent.analysis.pruning.experiment import Outcome, Row, Settings
+from mbagent.analysis.pruning.experiment import Key, Outcome, Settings, Way
+from mbagent.analysis.pruning.measures import SizeRow
+from mbagent.analysis.pruning.picture import draw_modules
+from mbagent.analysis.statistics import Interval, mean_interval
 
 CURVES: dict[str, str] = {
     "returned": "normalised return",
     "marginal": "error of single variables (total variation)",
     "log_likelihood": "nats a transition lost",
     "connections": "connections left",
-    "full": "µs for a next state, full sweep",
+    "used": "µs for a next state, as used",
     "parents": "parents of a variable",
 }
 """Fields of a row that are drawn against the pruned fraction."""
@@ -28,17 +31,29 @@ CURVES: dict[str, str] = {
 COLUMNS: dict[str, tuple[str, int]] = {
     "connections": ("Connections", 0),
     "returned": ("Normalised return", 3),
+    "change": ("Change", 4),
+    "half_width": ("±", 4),
     "log_likelihood": ("Nats lost", 4),
     "marginal": ("Error of single variables", 5),
-    "full": ("µs, full sweep", 2),
-    "short": ("µs, as used", 2),
+    "full": ("µs, all asked", 2),
+    "matrices": ("µs, matrices", 2),
+    "connected": ("µs, connections", 2),
+    "used": ("µs, as used", 2),
+    "speed_up": ("Times the speed", 1),
+    "variation": ("Total variation", 4),
     "parents": ("Parents", 1),
     "precision": ("Precision", 3),
     "recall": ("Recall", 3),
     "conditions_precision": ("of next variables: precision", 3),
     "conditions_recall": ("recall", 3),
+    "modules": ("Modules found", 2),
+    "seconds": ("Seconds", 1),
 }
-"""Fields of a row in the table: title and digits."""
+"""Fields of a row in the table, and what follows from several rows: title and digits."""
+
+COLOURS: dict[Way, str] = {"by size": "#9aa5b1", "by evidence": "#0b6e4f"}
+
+Cells = dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -48,78 +63,111 @@ class Section:
     Attributes:
         title: of the game.
         seeds: number of repetitions.
-        rows: for each share: the share and the means over seeds, by field.
-        curves: picture of the curves.
-        maps: (caption, picture) of the sums over paths, from the first seed.
-        modules, groups: of the share that the last map shows.
-        shown: that share.
+        rows: for each share and way: these and the means over seeds, by column.
+        others: microseconds of a next state by other networks, and how many times faster the best row is.
+        pictures: (caption, picture) of the curves, the sums over paths and the modules, these of the first seed.
+        modules, groups: of what the last map shows.
+        shown: that share and way.
     """
 
     title: str
     seeds: int
-    rows: list[tuple[float, dict[str, float]]]
-    curves: bytes
-    maps: list[tuple[str, bytes]]
+    rows: list[tuple[Key, Cells]]
+    others: dict[str, tuple[float, float]]
+    pictures: dict[str, tuple[str, bytes]]
     modules: list[str]
     groups: list[str]
-    shown: float
+    shown: Key
 
 
-def means(rows: Sequence[Row]) -> list[tuple[float, dict[str, float]]]:
-    """Means over seeds for each share; nan where it was not measured."""
-    result = []
-    for fraction in sorted({row.fraction for row in rows}):
-        mine = [row for row in rows if row.fraction == fraction]
-        result.append((fraction, {name: float(np.mean([getattr(row, name) for row in mine])) for name in COLUMNS}))
+def summary(outcomes: Sequence[Outcome]) -> list[tuple[Key, Cells]]:
+    """Means over seeds for each share and way, the change of the return in the same episodes, and the speed-up."""
+    result: list[tuple[Key, Cells]] = []
+    rows = [row for outcome in outcomes for row in outcome.rows]
+    first = rows[0].fraction, rows[0].way
+    for key in dict.fromkeys((row.fraction, row.way) for row in rows):
+        mine = [row for row in rows if (row.fraction, row.way) == key]
+        cells = {name: float(np.mean([getattr(row, name) for row in mine])) for name in COLUMNS if hasattr(mine[0], name)}
+        pairs = [outcome.returns[key] - outcome.returns[first] for outcome in outcomes if key in outcome.returns]
+        change = mean_interval(np.concatenate(pairs)) if key != first else Interval(0.0, 0.0, 0.0)
+        cells |= {"change": change.estimate, "half_width": change.high - change.estimate}
+        whole = result[0][1]["full"] if result else cells["full"]
+        result.append((key, {**cells, "speed_up": whole / cells["used"]}))
     return result
 
 
-def write_page(path: Path, outcomes: Sequence[Outcome], settings: Settings, command: str) -> dict[str, bytes]:
+def write_page(
+    path: Path, outcomes: Sequence[Outcome], settings: Settings, command: str, sizes: Sequence[SizeRow] = ()
+) -> dict[str, bytes]:
     """Writes the HTML page, pictures and all, into one file; returns the pictures as PNG by name."""
-    sections, pictures = [], {}
+    sections: list[Section] = []
+    pictures: dict[str, bytes] = {}
     for game in settings.games:
         mine = sorted((o for o in outcomes if o.task.game == game), key=lambda o: o.task.seed)
-        if not mine:
-            continue
-        section = section_of(mine)
-        sections.append(section)
-        pictures[f"{game}_curves"] = section.curves
-        pictures |= {f"{game}_paths_{number}": png for number, (_, png) in enumerate(section.maps)}
-    page = render("pruning.html.jinja", sections=sections, columns=COLUMNS, settings=settings, command=command)
+        if mine:
+            sections.append(section_of(mine))
+            pictures |= {f"{game}_{name}": png for name, (_, png) in sections[-1].pictures.items()}
+    page = render(
+        "pruning.html.jinja",
+        sections=sections,
+        columns=COLUMNS,
+        settings=settings,
+        command=command,
+        sizes=sizes,
+        exponents={name: exponent(sizes, name) for name in ("whole", "pruned")} if len({row.d for row in sizes}) > 1 else {},
+    )
     path.write_text(page, encoding="utf-8")
     return pictures
 
 
+def exponent(rows: Sequence[SizeRow], name: str) -> float:
+    """The power of d that a cost grows with: slope of the logarithms, by least squares."""
+    return float(np.polyfit(np.log([row.d for row in rows]), np.log([getattr(row, name) for row in rows]), 1)[0])
+
+
 def section_of(outcomes: Sequence[Outcome]) -> Section:
     """What the page says about one game."""
-    rows, first = means([row for outcome in outcomes for row in outcome.rows]), outcomes[0]
-    shown = max((f for f in first.influences if f <= 0.99), default=0.0)
-    maps = []
-    for fraction in sorted({min(first.influences), min((f for f in first.influences if f >= 0.9), default=shown), shown}):
-        caption = f"{fraction:.0%} of the connections removed" if fraction else "Before pruning"
-        maps.append((caption, draw_paths(first, fraction)))
+    rows, first = summary(outcomes), outcomes[0]
+    whole, (shown, best) = rows[0][0], rows[-1]
+    middle = next((key for key, _ in rows if key[0] >= 0.9), shown)
+    pictures: dict[str, tuple[str, bytes]] = {"curves": ("What is left against the pruned fraction", draw_curves(rows))}
+    for number, key in enumerate(dict.fromkeys((whole, middle, shown))):
+        pictures[f"paths_{number}"] = (captioned(key), draw_paths(first, key))
+    if (game := game_of(find_case(first.task.game))) is not None:
+        picture = draw_modules(first.influences[shown], game.observation_space.shape)
+        pictures["modules"] = (f"Modules, {captioned(shown)}", picture)
+    others = {name: float(np.mean([o.others[name] for o in outcomes])) for name in first.others}
     title = find_case(first.task.game).title
-    return Section(title, len(outcomes), rows, draw_curves(rows), maps, first.modules[shown], first.groups[shown], shown)
+    ratios = {name: (cost, cost / best["used"]) for name, cost in others.items()}
+    return Section(title, len(outcomes), rows, ratios, pictures, first.modules[shown], first.groups[shown], shown)
 
 
-def draw_curves(rows: Sequence[tuple[float, dict[str, float]]]) -> bytes:
-    """Everything against the pruned fraction."""
+def captioned(key: Key) -> str:
+    """What is said of a share and a way."""
+    return f"{key[0]:.0%} of the connections removed, {key[1]}" if key[0] else "before pruning"
+
+
+def draw_curves(rows: Sequence[tuple[Key, Cells]]) -> bytes:
+    """Everything against the pruned fraction, a line for each way."""
+    fractions = sorted({key[0] for key, _ in rows})
     with mpl.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(10, 4.8), layout="constrained")
         for axes, (name, label) in zip(figure.subplots(2, 3).flat, CURVES.items(), strict=True):
-            values = [cells[name] for _, cells in rows]
-            axes.plot(range(len(rows)), values, color="#0b6e4f", marker="o", markersize=4)
-            axes.set_xticks(range(len(rows)), [f"{fraction:.0%}" for fraction, _ in rows])
+            for way in dict.fromkeys(key[1] for key, _ in rows):
+                mine = [(fractions.index(key[0]), cells[name]) for key, cells in rows if key[1] == way or not key[0]]
+                axes.plot(*zip(*mine, strict=True), color=COLOURS[way], marker="o", markersize=4, label=way)
+            axes.set_xticks(range(len(fractions)), [f"{fraction:.0%}" for fraction in fractions])
             axes.set_title(label, loc="left")
-            if name in ("connections", "log_likelihood", "full") and min(values) > 0:
+            if name in ("connections", "log_likelihood", "used") and min(cells[name] for _, cells in rows) > 0:
                 axes.set_yscale("log")
             axes.set_xlabel("pruned")
+        figure.axes[0].legend(frameon=False)
         return to_png(figure)
 
 
-def draw_paths(outcome: Outcome, fraction: float) -> bytes:
+def draw_paths(outcome: Outcome, key: Key) -> bytes:
     """The paper's figures 11 and 12: sums of absolute weights over paths, from inputs (x) to outputs (y); darker is more."""
-    found, names = outcome.influences[fraction], [short(name) for name in outcome.names]
+    found, names = outcome.influences[key], [short(name) for name in outcome.names]
     parts = (
         (
             "predictor: state and action → next state",

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.modules import Influence
+from mbagent.models.modules import Influence, dependent_groups, modules
 from mbagent_envs.flier_catcher import FlierCatcher
 from mbagent_envs.game import Game
 
@@ -22,16 +22,30 @@ class Agreement(NamedTuple):
     recall: float
     conditions_precision: float
     conditions_recall: float
+    modules: float
 
 
 def agreement(game: Game, found: Influence) -> Agreement:
     """Of the connections that are left with the true dependencies."""
     parents, nan = float((found.states[:-1] > 0.0).sum(axis=1).mean()), float("nan")
     if not isinstance(game, FlierCatcher):
-        return Agreement(parents, nan, nan, nan, nan)
+        return Agreement(parents, nan, nan, nan, nan, nan)
     states, others = flier_catcher_dependencies(game)
     linked = found.others[:-1, :-1] > 0.0
-    return Agreement(parents, *_rates(found.states[:-1] > 0.0, states), *_rates(np.tril(linked | linked.T, -1), others))
+    rates = _rates(found.states[:-1] > 0.0, states), _rates(np.tril(linked | linked.T, -1), others)
+    true = flier_catcher_modules(game)
+    named = {frozenset(module.outputs.tolist()) for module in modules(found)}
+    groups = {frozenset(group.outputs.tolist()) for group in dependent_groups(found)}
+    hits = sum(module in named for module in true[:-1]) + (true[-1] in groups)
+    return Agreement(parents, *rates[0], *rates[1], hits / len(true))
+
+
+def flier_catcher_modules(game: FlierCatcher) -> list[frozenset[int]]:
+    """Variables that belong together: the player's rows, the cells of each row of fliers; at last the cells of new fliers."""
+    shape = game.observation_space.shape
+    number: NDArray[Any] = np.arange(int(np.prod(shape))).reshape(shape)
+    rows = [number[0, :, 0], *number[1], number[1, :, -1]]
+    return [frozenset(row.tolist()) for row in rows]
 
 
 def _rates(found: Bools, true: Bools) -> tuple[float, float]:

@@ -5,12 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mbagent.analysis.pruning.experiment import Outcome, Row, Settings, Task
-from mbagent.analysis.pruning.page import write_page
+from mbagent.analysis.pruning import measures
+from mbagent.analysis.pruning.experiment import Key, Outcome, Row, Settings, Task
+from mbagent.analysis.pruning.measures import SizeRow
+from mbagent.analysis.pruning.page import exponent, summary, write_page
+from mbagent.analysis.pruning.picture import draw_modules
 from mbagent.analysis.pruning.truth import agreement, flier_catcher_dependencies
+from mbagent.analysis.statistics import mean_interval
 from mbagent.models.modules import Influence
 from mbagent_envs import FlierCatcher
 from scripts.pruning import main
+from tests.models.test_pruning import N_BITS, fitted, shifted
 
 
 def perfect(game: FlierCatcher) -> Influence:
@@ -39,21 +44,71 @@ def test_the_true_dependencies_are_those_that_the_rules_show() -> None:
 def test_a_perfect_model_agrees_with_the_truth() -> None:
     game = FlierCatcher()
     found = agreement(game, perfect(game))
-    assert found[1:] == (1.0, 1.0, 1.0, 1.0)
+    assert found[1:] == (1.0, 1.0, 1.0, 1.0, 1.0)
+
+
+def outcome(seed: int, change: float) -> Outcome:
+    """As if FlierCatcher had been pruned without any loss of what is true."""
+    game, names = FlierCatcher(), tuple(f"observation[{i}]" for i in range(120))
+    found = Outcome(Task("flier_catcher", seed, SETTINGS), names, game.action_names)
+    for number, key in enumerate(KEYS):
+        speeds = 8.0, 4.0, 3.0, 2.0 / (1 + number)
+        found.rows.append(Row("flier_catcher", seed, *key, 100, 0.9, 0.5, 0.1, 0.1, *speeds, *([0.5] * 8)))
+        found.returns[key] = np.array([0.9, 1.1, 1.0]) + change * number
+        found.influences[key] = perfect(game)
+        found.modules[key], found.groups[key] = [f"module at {key}"], [f"group at {key}"]
+    found.others["the others"] = 20.0
+    return found
+
+
+KEYS: list[Key] = [(0.0, "by size"), (0.9, "by size"), (0.9, "by evidence")]
+SETTINGS = Settings(episodes=3, fractions=(0.0, 0.9), seeds=2)
+
+
+def test_changes_are_those_of_the_same_episodes_and_speeds_those_of_the_whole() -> None:
+    rows = dict(summary([outcome(1, 0.02), outcome(2, 0.04)]))
+    assert rows[KEYS[0]]["change"] == 0.0
+    assert rows[KEYS[1]]["change"] == pytest.approx(0.03)
+    assert rows[KEYS[1]]["half_width"] == pytest.approx(mean_interval([0.02] * 3 + [0.04] * 3).high - 0.03)
+    assert [rows[key]["speed_up"] for key in KEYS] == pytest.approx([4.0, 8.0, 12.0])
+
+
+def test_a_cost_that_grows_with_the_square_has_exponent_two() -> None:
+    rows = [SizeRow(d, 0, 10, float(d**2), float(d)) for d in (8, 16, 32)]
+    assert exponent(rows, "whole") == pytest.approx(2.0)
+    assert exponent(rows, "pruned") == pytest.approx(1.0)
 
 
 def test_the_page_names_variables_and_modules(tmp_path: Path) -> None:
-    settings, game = Settings(episodes=0, fractions=(0.0, 0.9)), FlierCatcher()
-    names = tuple(f"observation[{i}]" for i in range(120))
-    rows = [Row("flier_catcher", 1, share, 10, *([0.5] * 11)) for share in settings.fractions]
-    maps = {share: perfect(game) for share in settings.fractions}
-    lines = {share: [f"at {share}"] for share in settings.fractions}
-    outcome = Outcome(Task("flier_catcher", 1, settings), names, game.action_names, rows, maps, lines, lines)
-    pictures = write_page(tmp_path / "report.html", [outcome], settings, "command")
+    sizes = [SizeRow(d, 0, 10, 1.0, 0.5) for d in (8, 16)]
+    pictures = write_page(tmp_path / "report.html", [outcome(1, 0.0)], SETTINGS, "command", sizes)
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "at 0.9" in page
-    assert "90% of the connections removed" in page
-    assert {"flier_catcher_curves", "flier_catcher_paths_0", "flier_catcher_paths_1"} == set(pictures)
+    assert "module at (0.9" in page
+    assert "90% of the connections removed, by evidence" in page
+    assert "the others 20.0 µs, 30 times" in page
+    assert {f"flier_catcher_{name}" for name in ("curves", "paths_0", "paths_1", "paths_2", "modules")} == set(pictures)
+
+
+@pytest.mark.parametrize("shape", [(7,), (3, 4), (2, 3, 4)])
+def test_modules_are_drawn_for_any_observation(shape: tuple[int, ...]) -> None:
+    n = int(np.prod(shape))
+    chain = np.eye(n + 1, n, k=1)
+    found = Influence(chain, np.zeros((n + 1, 2)), np.zeros((n + 1, n + 1)), np.zeros((n + 1, n)))
+    assert draw_modules(found, shape).startswith(b"\x89PNG")
+
+
+def test_speeds_and_sizes_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measures, "microseconds", lambda call, rows: call() is None or 1.0)
+    data = shifted(600)
+    model = fitted(data)
+    rows = data.rows()
+    whole = measures.measure_speeds(model, rows.states, rows.actions, 0)
+    assert whole.variation == 0.0
+    model.prune(data, 0.9)
+    assert 0.0 < measures.measure_speeds(model, rows.states, rows.actions, 0).variation < 0.02
+    monkeypatch.setattr(measures, "trained", lambda sampler, d, seed: model)
+    monkeypatch.setattr(measures, "random_data", lambda d, n, seed: data)
+    assert measures.measure_size(N_BITS, 0)[3:] == (1.0, 1.0)
 
 
 def test_mistakes_get_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
