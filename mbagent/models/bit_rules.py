@@ -131,7 +131,7 @@ def sample_rules(states: Ints, actions: Ints, keys: Keys, rules: BitRules) -> tu
     n_bits, k = states.shape[1], borrowed(rules)
     table, bits, parents, copies, networks, room = k.table, k.bits, k.parents, k.copies, k.networks, room_for(k.networks)
     drawn, ended, none = np.empty_like(states), np.zeros(len(states), dtype=np.bool_), np.zeros((1, 1), dtype=np.int64)
-    outcome = np.zeros(n_bits + 1, dtype=np.int64)
+    outcome, chances, conditioned = np.zeros(n_bits + 1, dtype=np.int64), room.chances, room.conditioned
     for b in range(len(states)):
         action, state = actions[b], states[b]
         _copy(state, copies, outcome)
@@ -145,8 +145,10 @@ def sample_rules(states: Ints, actions: Ints, keys: Keys, rules: BitRules) -> tu
                     place += weight * outcome[parents[v]]
                     weight *= 2
                 one = table[place]
-            else:
+            elif conditioned[i]:
                 one = ask(networks, room, i, action, 0, state, outcome, none[0], none)
+            else:
+                one = chances[i]
             if one <= 0.0 or one >= 1.0:
                 outcome[i] = int(one >= 1.0)
             else:
@@ -205,7 +207,7 @@ def _by_outcome(q: int, place: int, weight: int, v: int, end: int, parents: Ints
 def rules_outcomes(k: BitRules, work: RulesWork, state: Ints, n_grid: int, key: np.uint64, offset: float, out: Outcomes) -> int:
     """See compiled_model."""
     table, bits, parents, networks, room, base, slot = k.table, k.bits, k.parents, k.networks, work.room, work.base, work.slot
-    grid, total, still_open, p = (n_grid, key, offset), 0, work.open, work.p
+    grid, total, still_open, p, chances, conditioned = (n_grid, key, offset), 0, work.open, work.p, room.chances, room.conditioned
     first_point, points, low, high, mass, factors = p.first, p.points, p.low, p.high, p.mass, p.factors
     see_state(networks, room, state)
     _copy(state, k.copies, base)
@@ -215,12 +217,14 @@ def rules_outcomes(k: BitRules, work: RulesWork, state: Ints, n_grid: int, key: 
         for r in range(len(bits)):
             i, start, end, chance = bits[r, 0], bits[r, 4], bits[r, 5], 0.5
             place, weight = _by_state(r, action, state, bits, parents)
-            shared = not leans_on_open(networks, room, i, base) if place < 0 else True
+            shared = not (place < 0 and conditioned[i] and leans_on_open(networks, i, base))
             for v in range(start, end):
                 shared = shared and base[parents[v]] >= 0
             if shared:  # the same for all particles
-                if place < 0:
+                if place < 0 and conditioned[i]:
                     chance = settled_chance(ask(networks, room, i, action, 0, state, base, slot, factors))
+                elif place < 0:
+                    chance = settled_chance(chances[i])
                 else:
                     chance = table[_by_outcome(0, place, weight, start, end, parents, base, slot, factors)]
                 if chance <= 0.0 or chance >= 1.0:

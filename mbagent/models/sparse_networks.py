@@ -155,12 +155,16 @@ class Room(NamedTuple):
         sums: what the state gives to the hidden nodes, [H].
         hidden: their values, [H].
         logits: the predictor's, [O].
+        chances: the predictor's P(bit = 1), [O].
+        conditioned: whether the bit is its group's to tell, which must be asked, bool [O].
         nodes: values of a group's nodes.
     """
 
     sums: Floats32
     hidden: Floats32
     logits: Floats
+    chances: Floats
+    conditioned: Bools
     nodes: Floats32
 
 
@@ -174,6 +178,8 @@ def room_for(k: SparseNetworks | None) -> Room:
         np.empty(n_hidden, dtype=np.float32),
         np.empty(n_hidden, dtype=np.float32),
         np.empty(n_outputs, dtype=np.float64),
+        np.empty(n_outputs, dtype=np.float64),
+        np.empty(n_outputs, dtype=np.bool_),
         np.empty(n_nodes, dtype=np.float32),
     )
 
@@ -199,12 +205,21 @@ def see_state(k: SparseNetworks | None, room: Room, state: Ints) -> None:
             _add_input(bit, sums, begin, other, weight)
 
 
+@inlined
+def _chance(logit: float) -> float:
+    """The logistic function, in double precision; 0 or 1 where it is next to that."""
+    if abs(logit) > SURE_LOGIT:
+        return 1.0 if logit > 0.0 else 0.0
+    return 1.0 / (1.0 + math.exp(-logit))
+
+
 @compiled
 def see_action(k: SparseNetworks | None, room: Room, state: Ints, action: int) -> None:
-    """Writes the predictor's logits of the bits asked for, after ``see_state``."""
+    """Writes what the predictor says of the bits asked for, after ``see_state``."""
     if k is None:
         return
     sums, hidden, logits, bias, stay, asked = room.sums, room.hidden, room.logits, k.output_bias, k.stay, k.asked
+    chances, conditioned, grouped, certain = room.chances, room.conditioned, k.groups.grouped, k.certain
     begin, other, weight = k.inputs
     for h in range(len(sums)):
         hidden[h] = sums[h]
@@ -218,28 +233,20 @@ def see_action(k: SparseNetworks | None, room: Room, state: Ints, action: int) -
                 logit += stay[action, i] * np.float64(2 * state[i] - 1)
             for v in range(begin[i], begin[i + 1]):
                 logit += weight[v] * np.float64(hidden[other[v]])
-            logits[i] = logit
-
-
-@inlined
-def _chance(logit: float) -> float:
-    """The logistic function, in double precision; 0 or 1 where it is next to that."""
-    if abs(logit) > SURE_LOGIT:
-        return 1.0 if logit > 0.0 else 0.0
-    return 1.0 / (1.0 + math.exp(-logit))
+            logits[i], chances[i] = logit, _chance(logit)
+            conditioned[i] = grouped[i] and abs(logit) < certain
 
 
 @compiled
-def leans_on_open(k: SparseNetworks | None, room: Room, i: int, base: Ints) -> bool:
-    """Whether what the networks say of bit i depends on an outcome bit that is open, -1 in ``base`` int64 [O]."""
+def leans_on_open(k: SparseNetworks | None, i: int, base: Ints) -> bool:
+    """Whether what the group of bit i says depends on an outcome bit that is open, -1 in ``base`` int64 [O]."""
     found = False
     if k is None:
         return found
     n_inputs, group = len(k.inputs.begin) - 1, k.groups.begin
-    if k.groups.grouped[i] and abs(room.logits[i]) < k.certain:
-        begin, other, _ = k.groups.links
-        for v in range(begin[group[i]], begin[group[i + 1]]):
-            found = found or (other[v] >= n_inputs and base[other[v] - n_inputs] < 0)
+    begin, other, _ = k.groups.links
+    for v in range(begin[group[i]], begin[group[i + 1]]):
+        found = found or (other[v] >= n_inputs and base[other[v] - n_inputs] < 0)
     return found
 
 
@@ -255,7 +262,7 @@ def ask(
     slot: Ints,
     factors: Ints,
 ) -> float:
-    """P(bit i = 1) in the eyes of a particle that knows the outcome bits before it, after ``see_action``.
+    """P(bit i = 1) by its group, in the eyes of a particle that knows the outcome bits before it, after ``see_action``.
 
     Args:
         k: the networks.
@@ -271,8 +278,6 @@ def ask(
     if k is None:
         return 0.5
     logit, groups, nodes = room.logits[i], k.groups, room.nodes
-    if not groups.grouped[i] or abs(logit) >= k.certain:
-        return _chance(logit)
     n_bits, n_inputs = len(state), len(k.inputs.begin) - 1
     first, last, readout, bias = groups.begin[i], groups.begin[i + 1], groups.readout, groups.bias
     begin, other, weight = groups.links
