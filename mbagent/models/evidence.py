@@ -2,8 +2,9 @@
 
 Among the weights that pruning by size leaves, some only fit the luck of the transitions met: a variable that is a mere coin keeps
 dozens of weak causes. A connection stays here only if to do without it costs more nats on the transitions met than half the
-logarithm of their number, which is what every number fitted to them is expected to gain by luck (Schwarz 1978, "Estimating the
-dimension of a model"). Each is looked at with the rest of the network as it is; what it gives on average goes to the bias.
+logarithm of their number (Schwarz 1978, "Estimating the dimension of a model") and the logarithm of how many inputs it was chosen
+from: the best of many gains by luck, too (Chen and Chen 2008, "Extended Bayesian information criteria for model selection with
+large model spaces"). Each is looked at with the rest of the network as it is; what it gives on average goes to the bias.
 Shapes: N rows, C columns of what a network says, H hidden nodes, I inputs, F factors that the columns stand for.
 """
 
@@ -31,15 +32,16 @@ class Judge:
         rows: the transitions.
         factor: that each column stands for, int64 [C]; a bit has one column, which is the logit of 1.
         logits: of the columns, [N, C]; kept up to date.
-        n_transitions: that the rows stand for; they set how much a connection has to be worth.
+        n_transitions: that the rows stand for.
+        n_candidates: inputs that each connection was chosen from; both set how much it has to be worth.
     """
 
-    def __init__(self, rows: Examples, factor: Tensor, logits: Tensor, n_transitions: int) -> None:
+    def __init__(self, rows: Examples, factor: Tensor, logits: Tensor, n_transitions: int, n_candidates: int) -> None:
         self.outcomes, self.factor, self.logits = rows.outcomes, factor, logits
         self.weights = rows.weights / rows.weights.sum()
         self.columns = {f: torch.nonzero(factor == f)[:, 0].tolist() for f in set(factor.tolist())}
         self.now = {f: self._nats(f, logits[:, self.columns[f]]) for f in self.columns}
-        self.price = 0.5 * math.log(max(n_transitions, 2)) / max(n_transitions, 1)
+        self.price = (0.5 * math.log(max(n_transitions, 2)) + math.log(max(n_candidates, 1))) / max(n_transitions, 1)
 
     def _nats(self, factor: int, logits: Tensor) -> float:
         """Mean loss on a factor whose columns are at ``logits`` [N, its columns]."""
@@ -186,7 +188,8 @@ def trim_predictor(predictor: DensePredictor, rows: Examples, n_transitions: int
     activation = ACTIVATIONS[predictor.activation]
     for layer in layers[:-1]:
         values = activation(layer(values))
-    judge = Judge(rows, codec.column_factor, _columns(codec, predictor(rows.states, rows.actions)), n_transitions)
+    said = _columns(codec, predictor(rows.states, rows.actions))
+    judge = Judge(rows, codec.column_factor, said, n_transitions, codec.n_inputs)
     everything = torch.arange(codec.n_columns)
     last = None
     if layers:
@@ -221,7 +224,7 @@ def trim_conditioner(conditioner: Conditioner, predictor: nn.Module, rows: Examp
         of_group = slice(g * size, (g + 1) * size)
         values = slice(1, 2) if codec.all_binary else slice(0, codec.outputs[factor])
         n = values.stop - values.start
-        judge = Judge(rows, torch.full((n,), factor), logits[:, factor, values].clone(), n_transitions)
+        judge = Judge(rows, torch.full((n,), factor), logits[:, factor, values].clone(), n_transitions, columns.shape[1])
         readout, offset = conditioner.readout[g, :, :n].T, conditioner.offset[g, 0, :n]
         layers = Layers(columns, groups.weight[of_group], groups.bias[of_group], readout, offset, activation, torch.arange(n))
         while layers.trim(judge):

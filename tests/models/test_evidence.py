@@ -67,7 +67,7 @@ def rows(n: int = 500) -> Examples:
 
 def test_what_a_connection_gives_on_average_goes_to_the_bias() -> None:
     given = rows()
-    judge = Judge(given, torch.arange(N_BITS + 1), torch.zeros(len(given), N_BITS + 1), 10**9)
+    judge = Judge(given, torch.arange(N_BITS + 1), torch.zeros(len(given), N_BITS + 1), 10**9, 1)
     judge.price = np.inf  # all must go
     weight, bias = torch.ones(1, 3), torch.zeros(1)
     inputs = torch.from_numpy(np.random.default_rng(0).random((len(given), 3)).astype(np.float32))
@@ -82,7 +82,7 @@ def test_what_a_connection_gives_on_average_goes_to_the_bias() -> None:
 
 def test_the_judge_charges_what_the_outcomes_lose() -> None:
     given = rows()
-    judge = Judge(given, torch.arange(N_BITS + 1), torch.zeros(len(given), N_BITS + 1), len(given))
+    judge = Judge(given, torch.arange(N_BITS + 1), torch.zeros(len(given), N_BITS + 1), len(given), 1)
     assert judge.price == pytest.approx(0.5 * np.log(len(given)) / len(given))
     right = 4.0 * given.outcomes[:, :1].float() - 2.0
     column = torch.tensor([0])
