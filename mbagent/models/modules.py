@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mbagent.models.network_pair import NetworkPair
 from mbagent.models.networks import Affine, Conditioner, DensePredictor
+from mbagent.models.tabulate import PARENT
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -59,8 +60,13 @@ class Module:
         return f"{', '.join(names[i] for i in self.outputs)} <- {', '.join(given) or 'nothing'}"
 
 
-def influence(model: NetworkPair) -> Influence:
+def influence(model: NetworkPair, *, effective: bool = False) -> Influence:
     """The sums over paths of both networks.
+
+    Args:
+        model: networks.
+        effective: leave out, in a pruned model of bits, what makes no difference, such as paths that cancel each other (see
+            ``tabulate.find_parents``).
 
     Raises:
         ValueError: the predictor is not a dense one: weights shared over positions have no variables of their own.
@@ -86,7 +92,11 @@ def influence(model: NetworkPair) -> Influence:
         members = model.conditioner.members.numpy()
         others[members] = seen[:, codec.n_inputs :] @ of_outputs.T
         conditions[members] = seen[:, :n_state] @ of_states
-    return Influence(rows[:, :n_state] @ of_states, rows[:, n_state:], others, conditions)
+    states = rows[:, :n_state] @ of_states
+    if effective and len(model.parents):
+        matters, n = model.parents == PARENT, states.shape[1]
+        states, conditions, others = states * matters[:, :n], conditions * matters[:, :n], others * matters[:, n:]
+    return Influence(states, rows[:, n_state:], others, conditions)
 
 
 def _absolute(layer: Affine) -> Floats:

@@ -144,6 +144,11 @@ class NetworkPair(BaseTransitionModel):
             parts["conditioner"] = self.conditioner
         return parts
 
+    @property
+    def parents(self) -> NDArray[np.int8]:
+        """What each outcome bit of a pruned model hangs on, see ``tabulate.find_parents``; of any other model empty."""
+        return self._marks
+
     def connections(self) -> dict[str, Connections]:
         """The weights of each network, and which of them are left."""
         return {part: Connections(module, self._pruned) for part, module in self._parts().items()}

@@ -300,11 +300,11 @@ class NeuralTransitionModel(NetworkPair):
         Raises:
             ValueError: weights are shared over positions, or the predictor is not a dense one.
         """
-        return modules(influence(self))
+        return modules(influence(self, effective=True))
 
     def dependent_groups(self) -> list[Module]:
         """The sets of variables that are drawn together, given state and action; as ``modules``."""
-        return dependent_groups(influence(self))
+        return dependent_groups(influence(self, effective=True))
 
     def _pair(self) -> Pair | None:
         """The networks, where they can become tables: of bits, single actions, and each bit given those before it, at most."""

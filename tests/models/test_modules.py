@@ -4,7 +4,11 @@ import numpy as np
 
 from mbagent.models.config import NeuralConfig
 from mbagent.models.modules import dependent_groups, influence, modules
+from mbagent.models.networks import DensePredictor
 from mbagent.models.neural import NeuralTransitionModel
+from mbagent.models.tabulate import Pair, find_parents
+from mbagent.models.training import examples
+from tests.models.helpers import dataset
 
 
 def sparse() -> NeuralTransitionModel:
@@ -36,3 +40,25 @@ def test_modules_and_groups_are_told_by_name() -> None:
     found, names = influence(sparse()), ("a", "b", "c", "d")
     assert {module.text(names) for module in modules(found)} == {"a, b <- b, action", "c, d <- d"}
     assert [group.text(names) for group in dependent_groups(found)] == ["b, d <- nothing"]
+
+
+def test_paths_that_cancel_each_other_link_nothing() -> None:
+    """Two nodes hold the sum and the difference of two bits: each bit's successor reads both, but hangs on one bit alone."""
+    rng = np.random.default_rng(0)
+    states = rng.integers(2, size=(400, 2))
+    data = dataset((2, 2), 2, states, rng.integers(2, size=400), states)
+    model = NeuralTransitionModel((2, 2), 2, NeuralConfig(hidden=(2,), activation="relu", residual=False, conditioner=None))
+    model.fit(data)
+    weights = {name: np.zeros_like(array) for name, array in model.state_dict().items()}
+    weights["predictor.layers.0.weight"][:, :2] = [[20.0, 20.0], [20.0, -20.0]]
+    weights["predictor.layers.0.bias"][:] = 0.0, 20.0
+    weights["predictor.out.weight"][:2] = [[1.0, 1.0], [1.0, -1.0]]
+    weights["predictor.out.bias"][:] = -40.0, 0.0, -40.0
+    model.load_state_dict(weights)
+    assert isinstance(model.predictor, DensePredictor)
+    marks = find_parents(Pair(model.predictor, None, 1.0), examples(data.rows()))
+    model.load_state_dict({**model.state_dict(), "pruned": marks})
+    assert (influence(model).states[:2] > 0.0).all()
+    assert (influence(model, effective=True).states[:2] > 0.0).tolist() == [[True, False], [False, True]]
+    assert [module.text(("a", "b")) for module in model.modules()] == ["a <- a", "b <- b"]
+    assert model.dependent_groups() == []

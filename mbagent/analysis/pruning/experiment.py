@@ -85,8 +85,8 @@ class Row:
             one has none.
         marginal: total variation of single variables from the true ones, mean over variables and inputs.
         full, matrices, connected, used, variation: see ``measures.Speeds``.
-        parents: state variables that lead to a variable, mean.
-        precision, recall: of the connections from state to next state that are left; nan where the truth is not written down.
+        parents: state variables that a variable hangs on, mean; before pruning, all that a path leads from.
+        precision, recall: of these; nan where the truth is not written down.
         conditions_precision, conditions_recall: of those between next variables.
         modules: share of the true modules, and groups of dependent variables, that are found exactly.
         seconds: of pruning and training.
@@ -134,7 +134,8 @@ class Outcome:
         actions: names of the actions.
         rows: one for each share and way.
         returns: normalised return of each episode, the same episodes in each.
-        influences: sums over paths.
+        influences: sums over all paths.
+        linked: sums over those that make a difference.
         modules, groups: a line for each module and each group of dependent variables.
         others: microseconds of a next state by other networks, see ``measures.measure_others``.
     """
@@ -145,6 +146,7 @@ class Outcome:
     rows: list[Row] = field(default_factory=list)
     returns: dict[Key, Floats] = field(default_factory=dict)
     influences: dict[Key, Influence] = field(default_factory=dict)
+    linked: dict[Key, Influence] = field(default_factory=dict)
     modules: dict[Key, list[str]] = field(default_factory=dict)
     groups: dict[Key, list[str]] = field(default_factory=dict)
     others: dict[str, float] = field(default_factory=dict)
@@ -183,7 +185,7 @@ def _measure(
     key: Key, case: Case, scale: Scale, agent: mbagent.ModelLearningAgent, model: NeuralTransitionModel, outcome: Outcome
 ) -> None:
     """Everything about one pruned agent, added to the outcome."""
-    task, report, found, game = outcome.task, agent.fit_report, influence(model), game_of(case)
+    task, report, found, game = outcome.task, agent.fit_report, influence(model, effective=True), game_of(case)
     assert game is not None
     outcome.returns[key] = _play(task, case, scale, agent)
     states, actions, following = unseen_play(case, task.seed)
@@ -203,7 +205,7 @@ def _measure(
         report.seconds if report is not None else float("nan"),
     )
     outcome.rows.append(row)
-    outcome.influences[key] = found
+    outcome.influences[key], outcome.linked[key] = influence(model), found
     outcome.modules[key] = [module.text(outcome.names) for module in modules(found)]
     outcome.groups[key] = [module.text(outcome.names) for module in dependent_groups(found)]
 

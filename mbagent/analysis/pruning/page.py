@@ -134,7 +134,7 @@ def section_of(outcomes: Sequence[Outcome]) -> Section:
     for number, key in enumerate(dict.fromkeys((whole, middle, shown))):
         pictures[f"paths_{number}"] = (captioned(key), draw_paths(first, key))
     if (game := game_of(find_case(first.task.game))) is not None:
-        picture = draw_modules(first.influences[shown], game.observation_space.shape)
+        picture = draw_modules(first.linked[shown], game.observation_space.shape)
         pictures["modules"] = (f"Modules, {captioned(shown)}", picture)
     others = {name: float(np.mean([o.others[name] for o in outcomes])) for name in first.others}
     title = find_case(first.task.game).title

@@ -55,7 +55,7 @@ def outcome(seed: int, change: float) -> Outcome:
         speeds = 8.0, 4.0, 3.0, 2.0 / (1 + number)
         found.rows.append(Row("flier_catcher", seed, *key, 100, 0.9, 0.5, 0.1, 0.1, *speeds, *([0.5] * 8)))
         found.returns[key] = np.array([0.9, 1.1, 1.0]) + change * number
-        found.influences[key] = perfect(game)
+        found.influences[key] = found.linked[key] = perfect(game)
         found.modules[key], found.groups[key] = [f"module at {key}"], [f"group at {key}"]
     found.others["the others"] = 20.0
     return found
