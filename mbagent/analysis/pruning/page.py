@@ -132,7 +132,7 @@ def section_of(outcomes: Sequence[Outcome]) -> Section:
     middle = next((key for key, _ in rows if key[0] >= 0.9), shown)
     pictures: dict[str, tuple[str, bytes]] = {"curves": ("What is left against the pruned fraction", draw_curves(rows))}
     for number, key in enumerate(dict.fromkeys((whole, middle, shown))):
-        pictures[f"paths_{number}"] = (captioned(key), draw_paths(first, key))
+        pictures[f"paths_{number}"] = (captioned(key), draw_paths(first, key, linked(first, shown)))
     if (game := game_of(find_case(first.task.game))) is not None:
         picture = draw_modules(first.linked[shown], game.observation_space.shape)
         pictures["modules"] = (f"Modules, {captioned(shown)}", picture)
@@ -165,24 +165,33 @@ def draw_curves(rows: Sequence[tuple[Key, Cells]]) -> bytes:
         return to_png(figure)
 
 
-def draw_paths(outcome: Outcome, key: Key) -> bytes:
+def draw_paths(outcome: Outcome, key: Key, variables: Sequence[int]) -> bytes:
     """The paper's figures 11 and 12: sums of absolute weights over paths, from inputs (x) to outputs (y); darker is more."""
-    found, names = outcome.influences[key], [short(name) for name in outcome.names]
+    found, some = outcome.influences[key], np.asarray(variables, dtype=np.int64)
+    names = [short(outcome.names[i]) for i in some]
+    rows = np.append(some, len(found.states) - 1)  # the end, too
+    states, actions, others = found.states[np.ix_(rows, some)], found.actions[rows], found.others[np.ix_(rows, rows)]
     parts = (
-        (
-            "predictor: state and action → next state",
-            np.concatenate([found.states, found.actions], axis=1),
-            [*names, *outcome.actions],
-        ),
-        ("conditioner: other next variables → next state", found.others, [*names, "end"]),
+        ("predictor: state and action → next state", np.concatenate([states, actions], axis=1), [*names, *outcome.actions]),
+        ("conditioner: other next variables → next state", others, [*names, "end"]),
     )
     with mpl.rc_context(FIGURE_STYLE):
-        size = max(6.0, 0.085 * len(names))
+        size = max(6.0, 0.1 * len(names))
         figure = Figure(figsize=(2 * size, size), layout="constrained")
         for axes, (title, values, inputs) in zip(figure.subplots(1, 2), parts, strict=True):
             _draw_map(axes, values, inputs, [*names, "end"])
             axes.set_title(title, loc="left")
         return to_png(figure)
+
+
+def linked(outcome: Outcome, key: Key) -> list[int]:
+    """The state variables that lead to one or that something leads to; all if there are none."""
+    found = outcome.influences[key]
+    n = len(outcome.names)
+    out = (found.states > 0.0).any(axis=0) | (found.conditions > 0.0).any(axis=0) | (found.others[:, :n] > 0.0).any(axis=0)
+    into = [(part[:n] > 0.0).any(axis=1) for part in (found.states, found.actions, found.others, found.conditions)]
+    some: list[int] = np.flatnonzero(out | np.any(into, axis=0)).tolist()
+    return some or list(range(n))
 
 
 def _draw_map(axes: Axes, values: np.ndarray, inputs: Sequence[str], outputs: Sequence[str]) -> None:
