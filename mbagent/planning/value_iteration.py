@@ -213,6 +213,10 @@ def _lead_to_news(graph: GraphArrays, q: Floats, tie: float, gamma: float, max_s
             break
 
 
+DRAWS, MOST_SAMPLES = 1_000_000, 256
+"""Draws of a machine in which there is luck, and of each (state, action) pair, at most: a small machine affords more."""
+
+
 class Machine:
     """The finite-state machine reachable from the known start states, solved anew for each goal.
 
@@ -232,6 +236,10 @@ class Machine:
         """See the class."""
         graph, complete = grow_reachable(model, start, max_states, n_samples, seed)
         self.graph = graph if complete and len(start) else None
+        more = _affordable(graph, n_samples)
+        if self.graph is not None and more > n_samples:
+            finer, complete = grow_reachable(model, start, max_states, more, seed)
+            self.graph = finer if complete else graph
         self.values: Values | None = None
 
     def set_goal(self, goal: Goal, gamma: float) -> None:
@@ -244,3 +252,11 @@ class Machine:
             return np.full(len(states), -1, dtype=np.int64)
         nodes = self.graph.find(states)
         return np.where((nodes >= 0) & self.graph.expanded[nodes], nodes, -1)
+
+
+def _affordable(graph: StateGraph, n_samples: int) -> int:
+    """How many draws for each (state, action) a machine of this size may cost, where there is any luck."""
+    if n_samples >= MOST_SAMPLES or graph.counts.max(initial=0) <= 1:
+        return n_samples
+    each = DRAWS // max(graph.counts.size, 1)
+    return max(n_samples, min(MOST_SAMPLES, 1 << max(each, 1).bit_length() - 1))

@@ -2,12 +2,13 @@ import numpy as np
 import pytest
 
 from mbagent.models import SimulatorModel
+from mbagent.models.base import BaseTransitionModel
 from mbagent.models.reachable import ReachableMDP, grow_reachable
 from mbagent.models.state_graph import StateGraph
 from mbagent.planning.lookahead import grow_lookahead
 from mbagent.planning.machine_planner import MachinePlanner
 from mbagent.planning.planner import PlannerSettings
-from mbagent.planning.value_iteration import solve
+from mbagent.planning.value_iteration import MOST_SAMPLES, Machine, solve
 from mbagent_envs.geyser_runner import GeyserRunner
 from tests.worlds import TableWorld, arrival_goal, optimal_q, random_table
 
@@ -195,3 +196,27 @@ def test_where_nothing_matters_in_sight_the_agent_makes_for_what_it_has_not_imag
     assert plan.actions.tolist() == [1, 1, 1]
     planner.set_goal(arrival_goal((np.arange(n) == 0).astype(np.float64)))
     assert planner.plan(np.array([[2]])).actions[0] == 0  # a prize comes first
+
+
+def test_a_small_machine_is_drawn_more_finely() -> None:
+    drawn = SampledGame(GeyserRunner())
+    machine = Machine(drawn, drawn.start_states(64), max_states=3000, n_samples=16, seed=0)
+    assert machine.graph is not None
+    assert abs(machine.graph.probabilities - 0.2).max() < 5 * np.sqrt(0.2 * 0.8 / MOST_SAMPLES)
+
+
+def test_what_finer_draws_find_does_not_cost_the_machine() -> None:
+    table = np.zeros((40, 1, 40))
+    table[:, 0, 0], table[0, 0, 1:] = 1.0, 0.002  # ways out of one state, all of which only many draws meet
+    table[0, 0, 1] = 0.5
+    table[0, 0, 0] = 1.0 - table[0, 0, 1:].sum()
+    machine = Machine(SampledWorld(table), np.array([[0]]), max_states=5, n_samples=4, seed=0)
+    assert machine.graph is not None
+    assert 2 <= machine.graph.expanded.sum() <= 5
+    assert not grow_reachable(SampledWorld(table), np.array([[0]]), 5, MOST_SAMPLES, 0)[1]
+
+
+class SampledWorld(TableWorld):
+    """A table that is only drawn from."""
+
+    successors = BaseTransitionModel.successors
