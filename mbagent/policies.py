@@ -237,7 +237,7 @@ def as_batch(space: spaces.Space[Any], observation: Any) -> tuple[Any, bool]:
     """The observation as a batch, and whether it was a single one.
 
     Raises:
-        ValueError: its shape is neither that of one observation of ``space`` nor of a batch of them.
+        ValueError: it is not made of numbers, or its shape is neither that of one observation of ``space`` nor of a batch.
     """
     if isinstance(space, spaces.Dict):
         if not isinstance(observation, Mapping) or set(observation) != set(space.spaces):
@@ -249,7 +249,12 @@ def as_batch(space: spaces.Space[Any], observation: Any) -> tuple[Any, bool]:
             raise ValueError(f"The observation must be a tuple of {len(space.spaces)} parts, got {observation!r}.")
         pairs = [as_batch(part, value) for part, value in zip(space.spaces, observation, strict=True)]
         return tuple(batch for batch, _ in pairs), _all_single(pairs)
-    array, shape = np.asarray(observation), tuple(space.shape or ())
+    try:
+        array, shape = np.asarray(observation), tuple(space.shape or ())
+    except ValueError:
+        array, shape = np.asarray(None), tuple(space.shape or ())  # rows of unequal length
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"The observation must be numbers of {space}, as the environment returns them, got {observation!r}.")
     if array.shape == shape:
         return array[None], True
     if array.shape[1:] == shape and array.ndim == len(shape) + 1:

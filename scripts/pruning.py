@@ -24,7 +24,7 @@ from mbagent.analysis.folders import check_run, open_folder, write_csv
 from mbagent.analysis.parallel import run_all
 from mbagent.analysis.pruning.experiment import FRACTIONS, GAMES, Networks, Outcome, Settings, Way, plan, run_task
 from mbagent.analysis.pruning.measures import measure_size
-from mbagent.analysis.pruning.page import write_page
+from mbagent.analysis.pruning.page import summary_rows, write_page
 
 SIZES = (16, 32, 64, 128)
 """Numbers of variables."""
@@ -97,6 +97,7 @@ def main(argv: list[str] | None = None) -> int:
     for outcome in work:
         outcomes.append(outcome)
         write_csv(args.output / "results.csv", [asdict(row) for o in outcomes for row in o.rows])
+        write_csv(args.output / "summary.csv", summary_rows(outcomes))
         for name, png in write_page(args.output / "report.html", outcomes, settings, command, costs).items():
             (args.output / f"{name}.png").write_bytes(png)
     console.print(f"Wrote report.html, results.csv and the figures to {args.output}.")

@@ -1,4 +1,4 @@
-"""Writes the tables of results that the README shows, from the results.csv of a comparison and of the sampling accuracy.
+"""Writes the tables of results that the README shows, from what a comparison, the sampling accuracy and pruning have written.
 
 python scripts/results_table.py --results results/compare/results.csv --accuracy results/sampling_accuracy/results.csv
 """
@@ -19,6 +19,7 @@ from rich.console import Console
 from mbagent.analysis.accuracy.results import load_scores
 from mbagent.analysis.accuracy.summary import markdown_table
 from mbagent.analysis.cases import CASES
+from mbagent.analysis.pruning.page import markdown_table as pruning_table
 from mbagent.analysis.records import AGENT, LEARNED_REWARD, TRUE_MODEL
 from mbagent.analysis.statistics import interquartile_mean
 
@@ -34,10 +35,12 @@ class Args:
     """What a comparison wrote."""
     accuracy: Path = Path("results/sampling_accuracy/results.csv")
     """What scripts/sampling_accuracy.py wrote."""
+    pruning: tuple[Path, ...] = (Path("results/pruning/summary.csv"),)
+    """What scripts/pruning.py wrote, one file or more."""
     baselines: Path | None = None
     """Where the baselines' rows are, if in another file."""
     readme: Path = Path("README.md")
-    """The tables go between the marks <!-- results --> and <!-- accuracy --> in this file."""
+    """The tables go between the marks <!-- results -->, <!-- accuracy --> and <!-- pruning --> in this file."""
 
 
 Scores = dict[tuple[str, str, str], list[float]]
@@ -87,12 +90,14 @@ def main(args: Args) -> None:
         tables["results"] = table(scores, read(args.baselines) if args.baselines else scores)
     if args.accuracy.exists():
         tables["accuracy"] = markdown_table(load_scores(args.accuracy))
+    if all(path.exists() for path in args.pruning):
+        tables["pruning"] = pruning_table(args.pruning)
     text = args.readme.read_text(encoding="utf-8")
     for name, filled in tables.items():
         mark = f"<!-- {name} -->"
         text = re.sub(f"{mark}.*{mark}", f"{mark}\n{filled}\n{mark}", text, flags=re.DOTALL)
     args.readme.write_text(text, encoding="utf-8")
-    Console().print(f"Wrote {' and '.join(tables) or 'nothing: neither file exists'} to {args.readme}.")
+    Console().print(f"Wrote {' and '.join(tables) or 'nothing: no file exists'} to {args.readme}.")
 
 
 if __name__ == "__main__":

@@ -231,3 +231,10 @@ def test_a_kept_tree_is_dropped_at_episode_starts_and_with_goals(learned: dict[s
 def test_planning_settings_out_of_range_are_refused(policy: str, kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         ModelLearningAgent(policy, Corridor(), **kwargs)
+
+
+@pytest.mark.parametrize("wrong", ["a", None, {"a": 1}, [[1, 2], [3]]])
+def test_what_is_no_observation_at_all_gets_one_sentence(wrong: Any) -> None:
+    agent = ModelLearningAgent("MctsPolicy", gym.make("FrozenLake-v1"), seed=0)
+    with pytest.raises(ValueError, match="must be numbers of Discrete"):
+        agent.predict(wrong)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mbagent.analysis.cases import find_case, game_of
-from mbagent.analysis.pages import FIGURE_STYLE, render, to_png
+from mbagent.analysis.pages import FIGURE_STYLE, format_number, render, to_png
 from mbagent.analysis.pruning.experiment import Key, Outcome, Settings, Way
 from mbagent.analysis.pruning.measures import SizeRow
 from mbagent.analysis.pruning.picture import draw_modules
@@ -94,6 +95,33 @@ def summary(outcomes: Sequence[Outcome]) -> list[tuple[Key, Cells]]:
         whole = result[0][1]["full"] if result else cells["full"]
         result.append((key, {**cells, "speed_up": whole / cells["used"]}))
     return result
+
+
+def summary_rows(outcomes: Sequence[Outcome]) -> list[dict[str, str | int | float]]:
+    """The summary of each game as rows for a file."""
+    rows: list[dict[str, str | int | float]] = []
+    for game in dict.fromkeys(outcome.task.game for outcome in outcomes):
+        mine = [outcome for outcome in outcomes if outcome.task.game == game]
+        for (fraction, way), cells in summary(mine):
+            rows.append({"game": game, "seeds": len(mine), "fraction": fraction, "way": way, **cells})
+    return rows
+
+
+def markdown_table(paths: Sequence[Path]) -> str:
+    """The README's table, from files of ``summary_rows``."""
+    titles = ["", "pruned", "connections", "return", "change", "nats lost", "µs", "precision", "recall", "modules"]
+    lines = ["| " + " | ".join(titles) + " |", "| --- | --- |" + " ---: |" * (len(titles) - 2)]
+    for path in paths:
+        with path.open(encoding="utf-8", newline="") as file:
+            for row in csv.DictReader(file):
+                fraction, cell = float(row["fraction"]), {k: float(v) for k, v in row.items() if k not in ("game", "way")}
+                change = f"{format_number(cell['change'], 4)} ± {cell['half_width']:.4f}" if fraction else ""
+                shown = [find_case(row["game"]).title, f"{fraction:.0%}, {row['way']}" if fraction else "no"]
+                shown += [format_number(cell["connections"], 0), format_number(cell["returned"], 3), change]
+                shown += [format_number(cell[name], digits) for name, digits in (("log_likelihood", 4), ("used", 2))]
+                shown += [format_number(cell[name], 2) for name in ("precision", "recall", "modules")]
+                lines.append("| " + " | ".join(shown) + " |")
+    return "\n".join(lines)
 
 
 def write_page(

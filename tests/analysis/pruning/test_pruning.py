@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mbagent.analysis.folders import write_csv
 from mbagent.analysis.pruning import measures
 from mbagent.analysis.pruning.experiment import Key, Outcome, Row, Settings, Task
 from mbagent.analysis.pruning.measures import SizeRow
-from mbagent.analysis.pruning.page import exponent, summary, write_page
+from mbagent.analysis.pruning.page import exponent, markdown_table, summary, summary_rows, write_page
 from mbagent.analysis.pruning.picture import draw_modules
 from mbagent.analysis.pruning.truth import agreement, flier_catcher_dependencies
 from mbagent.analysis.statistics import mean_interval
@@ -71,6 +72,15 @@ def test_changes_are_those_of_the_same_episodes_and_speeds_those_of_the_whole() 
     assert rows[KEYS[1]]["change"] == pytest.approx(0.03)
     assert rows[KEYS[1]]["half_width"] == pytest.approx(mean_interval([0.02] * 3 + [0.04] * 3).high - 0.03)
     assert [rows[key]["speed_up"] for key in KEYS] == pytest.approx([4.0, 8.0, 12.0])
+
+
+def test_the_readmes_table_is_made_of_the_summary(tmp_path: Path) -> None:
+    write_csv(tmp_path / "summary.csv", summary_rows([outcome(1, 0.02), outcome(2, 0.04)]))
+    lines = markdown_table([tmp_path / "summary.csv"]).splitlines()
+    assert len(lines) == 2 + len(KEYS)
+    assert lines[2].startswith("| FlierCatcher | no | 100 | 0.500 |  |")
+    assert "90%, by evidence" in lines[4]
+    assert "0.0600 ±" in lines[4]
 
 
 def test_a_cost_that_grows_with_the_square_has_exponent_two() -> None:
