@@ -9,7 +9,7 @@ import csv
 import re
 import statistics
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from rich.console import Console
 from mbagent.analysis.accuracy.results import load_scores
 from mbagent.analysis.accuracy.summary import markdown_table
 from mbagent.analysis.cases import CASES
+from mbagent.analysis.external.summary import markdown_table as external_table
 from mbagent.analysis.pruning.page import markdown_table as pruning_table
 from mbagent.analysis.records import AGENT, LEARNED_REWARD, TRUE_MODEL
 from mbagent.analysis.statistics import interquartile_mean
@@ -37,10 +38,14 @@ class Args:
     """What scripts/sampling_accuracy.py wrote."""
     pruning: tuple[Path, ...] = (Path("results/pruning/summary.csv"),)
     """What scripts/pruning.py wrote, one file or more."""
+    external: tuple[Path, ...] = (Path("results/external/results.csv"),)
+    """What scripts/external_benchmark.py wrote; of several files the last one that has a world and an agent counts."""
     baselines: Path | None = None
     """Where the baselines' rows are, if in another file."""
     readme: Path = Path("README.md")
     """The tables go between the marks <!-- results -->, <!-- accuracy --> and <!-- pruning --> in this file."""
+    environments: Path = Path("docs/environments.md")
+    """Likewise <!-- external -->."""
 
 
 Scores = dict[tuple[str, str, str], list[float]]
@@ -82,8 +87,17 @@ def table(scores: Scores, others: Scores) -> str:
     return "\n".join(lines)
 
 
+def _fill(document: Path, tables: Mapping[str, str]) -> None:
+    """Puts each table between its marks."""
+    text = document.read_text(encoding="utf-8")
+    for name, filled in tables.items():
+        mark = f"<!-- {name} -->"
+        text = re.sub(f"{mark}.*{mark}", f"{mark}\n{filled}\n{mark}", text, flags=re.DOTALL)
+    document.write_text(text, encoding="utf-8")
+
+
 def main(args: Args) -> None:
-    """Writes the tables into the README."""
+    """Writes the tables into the documents."""
     tables = {}
     if args.results.exists():
         scores = read(args.results)
@@ -92,12 +106,11 @@ def main(args: Args) -> None:
         tables["accuracy"] = markdown_table(load_scores(args.accuracy))
     if all(path.exists() for path in args.pruning):
         tables["pruning"] = pruning_table(args.pruning)
-    text = args.readme.read_text(encoding="utf-8")
-    for name, filled in tables.items():
-        mark = f"<!-- {name} -->"
-        text = re.sub(f"{mark}.*{mark}", f"{mark}\n{filled}\n{mark}", text, flags=re.DOTALL)
-    args.readme.write_text(text, encoding="utf-8")
-    Console().print(f"Wrote {' and '.join(tables) or 'nothing: no file exists'} to {args.readme}.")
+    _fill(args.readme, tables)
+    if all(path.exists() for path in args.external):
+        _fill(args.environments, {"external": external_table(args.external)})
+        tables["external"] = ""
+    Console().print(f"Wrote {' and '.join(tables) or 'nothing: no file exists'} to the documents.")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,25 @@
+"""The documentation's table: worlds in order, later files before earlier ones, shares where no optimum is known."""
+
+from pathlib import Path
+
+from mbagent.analysis.external.summary import markdown_table
+from mbagent.analysis.folders import write_csv
+
+
+def rows(world: str, agent: str, normalised: list[float], positive: float = 0.5) -> list[dict[str, object]]:
+    more = {"positive": positive, "learn_seconds": 2.0, "milliseconds": 0.5}
+    return [{"world": world, "agent": agent, "normalised": value, **more} for value in normalised]
+
+
+def test_the_table_holds_the_last_of_each(tmp_path: Path) -> None:
+    nan = float("nan")
+    first = [
+        *rows("Taxi", "mbagent", [0.1, 0.2]),
+        *rows("MiniGrid Empty", "mbagent", [nan, nan], 0.75),
+        *rows("Taxi", "PPO", [0.3]),
+    ]
+    write_csv(tmp_path / "first.csv", first)
+    write_csv(tmp_path / "second.csv", rows("Taxi", "mbagent", [0.5, 0.9]))
+    lines = markdown_table([tmp_path / "first.csv", tmp_path / "second.csv"]).splitlines()
+    assert lines[0] == "| | mbagent | PPO | learning, s | decision, ms |"
+    assert lines[2:] == ["| Taxi | 0.700 | 0.300 | 2.0 | 0.50 |", "| MiniGrid Empty | 75% | – | 2.0 | 0.50 |"]
