@@ -31,7 +31,7 @@ from mbagent.models.packing import CompiledBody, as_rows, compiled_body, pack_de
 from mbagent.models.pruning import PruningConfig, check_fraction
 from mbagent.models.retraining import prune_networks
 from mbagent.models.samplers import log_prob_causal, sample_causal, sample_independent
-from mbagent.models.sparse_networks import pack_sparse
+from mbagent.models.sparse_networks import n_links, pack_sparse
 from mbagent.models.sweeps import sample_sweeps
 from mbagent.models.systematic import causal_successors, independent_successors
 from mbagent.models.tabulate import Pair, find_parents, tabulable, tabulate
@@ -40,13 +40,16 @@ from mbagent.transitions import TransitionBatch, TransitionDataset
 
 PrunedAs: TypeAlias = Literal["tables", "connections", "matrices"]
 
+FEW = 0.2
+"""Share of the connections up to which lists of them are quicker than whole matrices, which processors multiply in bulk."""
+
 
 class NeuralTransitionModel(NetworkPair):
     """A predictor network, alone or with a conditioner network. Arguments are those of NetworkPair.
 
     Attributes:
         pruned_as: what a pruned model of bits is drawn from: "tables" of bits that few inputs are left of, the others'
-            connections; "connections" of all; or the whole "matrices", as before pruning.
+            connections if these are few; "connections" of all; or the whole "matrices", as before pruning.
     """
 
     pruned_as: PrunedAs = "tables"
@@ -287,7 +290,8 @@ class NeuralTransitionModel(NetworkPair):
         if key not in self._rules:
             few = tabulable(self._marks) & (self.pruned_as == "tables")
             networks = None if few.all() else pack_sparse(pair.predictor, pair.conditioner, self.config.certain, ~few)
-            if networks is None and not few.all():
+            many = FEW * sum(part.total for part in self.connections().values()) if self.pruned_as == "tables" else np.inf
+            if not few.all() and (networks is None or n_links(networks) > many):
                 self._rules[key] = (None, None)
             else:
                 left = tabulate(pair, self._marks, few), networks, self.codec.n_actions

@@ -122,6 +122,11 @@ def pack_sparse(
     )
 
 
+def n_links(k: SparseNetworks) -> int:
+    """How many connections there are."""
+    return sum(len(links.weight) for links in (k.inputs, k.outputs, k.groups.links))
+
+
 def _groups(conditioner: Conditioner | None, asked: Bools, n_columns: int) -> SparseGroups:
     counts, offset, grouped = np.zeros(len(asked), np.int64), np.zeros(len(asked), np.float32), np.zeros_like(asked)
     weight, bias, readout = np.zeros((0, n_columns), np.float32), np.zeros(0, np.float32), np.zeros(0, np.float32)

@@ -90,7 +90,7 @@ def paths(pair: Pair) -> NDArray[np.bool_]:
         bits = np.arange(codec.n_state_columns)
         reach[bits, bits] |= left.any(axis=0)
         reach[bits, codec.n_state_columns : n_inputs] |= left.T
-    if conditioner is not None:
+    if conditioner is not None and len(conditioner.members):
         weight = conditioner.groups.weight.detach()
         weight = weight if conditioner.groups.mask is None else weight * conditioner.groups.mask
         read = (conditioner.readout.detach() != 0.0).any(dim=2).double()

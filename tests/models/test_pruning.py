@@ -8,6 +8,7 @@ from mbagent.models.config import NeuralConfig
 from mbagent.models.neural import NeuralTransitionModel
 from mbagent.models.planes import PlanePredictor
 from mbagent.models.pruning import Connections, PruningConfig, Shrinking
+from mbagent.models.tabulate import PARENT
 from mbagent.models.training import TrainingConfig
 from mbagent.spaces import PlaneLayout
 from mbagent.transitions import TransitionDataset
@@ -101,3 +102,27 @@ def test_the_smallest_go(gradual: bool) -> None:
         shrinking.after_step(step / 20)
     assert shrinking.finished
     assert torch.equal(layer.weight.data, torch.where(weights.abs() > 1.0, weights, torch.zeros(())))
+
+
+def test_a_world_in_which_nothing_is_open_is_pruned_too() -> None:
+    nothing, actions = np.zeros((300, 4), dtype=np.int64), np.arange(300) % 2
+    model = fitted(data := dataset((2,) * 4, 2, nothing, actions, nothing))
+    assert model.conditioner is not None
+    assert len(model.conditioner.members) == 0
+    model.prune(data, 0.9)
+    drawn, ended = model.sample(nothing, actions, np.random.default_rng(1))
+    assert not drawn.any()
+    assert not ended.any()
+
+
+def test_what_many_connections_are_left_of_goes_by_whole_matrices() -> None:
+    data = shifted(400)
+    model = fitted(data)
+    model.prune(data, 0.1, config=PruningConfig(evidence=False))
+    model._marks[:] = PARENT
+    model.load_state_dict(model.state_dict())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mbagent.models.tabulate.MOST_PARENTS", 1)
+        assert model.rules() is None
+        model.pruned_as = "connections"
+        assert model.rules() is not None
