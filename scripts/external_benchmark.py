@@ -53,6 +53,8 @@ class Args:
     """Environment steps for learning; by default 20,000, FrozenLake 8x8 50,000."""
     baseline_steps: int | None = None
     """Steps for PPO and DQN; by default the same."""
+    reward_scale: float | None = None
+    """What rewards are multiplied with where PPO and DQN are trained; by default 1 for PPO and 0.1 for DQN."""
     output: Path = Path("results/external")
     """Folder for results.csv; results of an earlier run there are moved to a folder of their own inside it."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
@@ -75,13 +77,16 @@ def plan(args: Args) -> list[Task]:
     for name, number in numbers.items():
         if number < 1:
             raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {number}.")
+    if args.reward_scale is not None and not 0.0 < args.reward_scale < float("inf"):
+        raise ValueError(f"--reward-scale must be a positive number, got {args.reward_scale}.")
     tasks = []
     for world in map(find_world, args.worlds):
         steps = args.steps or world.steps
         for agent in args.agents:
-            if world.missing is None and not (agent == TRUE and world.kind in ("minigrid", "binned")):
+            if world.missing is None and not (agent == TRUE and world.kind == "binned"):
                 more = [
-                    Task(world, agent, args.first_seed + i, steps, episodes, args.baseline_steps or steps) for i in range(seeds)
+                    Task(world, agent, args.first_seed + i, steps, episodes, args.baseline_steps or steps, args.reward_scale)
+                    for i in range(seeds)
                 ]
                 tasks += more
     return tasks

@@ -105,6 +105,7 @@ def train_baseline(
     seed: int,
     evaluate: Evaluate,
     points: int = 10,
+    reward_scale: float | None = None,
     report: Callable[[float], None] | None = None,
 ) -> tuple[BaseAlgorithm, Curve]:
     """Trains one baseline.
@@ -116,13 +117,15 @@ def train_baseline(
         seed: seed of networks, exploration and environments.
         evaluate: mean return of a policy (and whether it is deterministic), for the learning curve.
         points: evaluations on the learning curve, besides the one before training.
+        reward_scale: what rewards are multiplied with for training; None for what SETTINGS say.
         report: told the share of steps done, 0 ... 1.
 
     Returns:
         (the trained algorithm, learning curve as (environment steps, mean return)).
     """
     settings = dict(SETTINGS[name])
-    scale = settings.pop("reward_scale", 1.0)
+    usual = settings.pop("reward_scale", 1.0)
+    scale = usual if reward_scale is None else reward_scale
 
     def make_scaled() -> gym.Env[Any, Any]:
         return TransformReward(make_env(), lambda reward: scale * float(reward))

@@ -40,6 +40,7 @@ class Task:
         steps: environment steps for learning.
         episodes: to play.
         baseline_steps: steps for the baselines, which may be more.
+        reward_scale: what their rewards are multiplied with for training; None for their usual scale.
     """
 
     world: World
@@ -48,6 +49,7 @@ class Task:
     steps: int
     episodes: int
     baseline_steps: int
+    reward_scale: float | None = None
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,13 @@ def _players(task: Task) -> Sequence[Callable[[], Player]]:
     name = cast("BaselineName", "PPO" if task.agent == IMAGINED else task.agent)
     began = time.perf_counter()
     algorithm, _ = train_baseline(
-        name, make_env, steps=task.baseline_steps, seed=task.seed, evaluate=lambda policy, repeatable: 0.0, points=1
+        name,
+        make_env,
+        steps=task.baseline_steps,
+        seed=task.seed,
+        evaluate=lambda policy, repeatable: 0.0,
+        points=1,
+        reward_scale=task.reward_scale,
     )
     seconds = time.perf_counter() - began
     return tuple(

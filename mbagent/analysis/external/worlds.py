@@ -19,6 +19,7 @@ from mbagent.analysis.cases import Scale
 from mbagent.analysis.evaluation import evaluate_env, random_policy
 from mbagent.analysis.external.exact import Exact, exact_rddl, exact_toy_text
 from mbagent.analysis.external.rddl_truth import RddlModel, RddlTables, rddl_tables
+from mbagent.analysis.external.snapshots import SnapshotModel
 from mbagent.models.base import TransitionModel
 from mbagent.models.table import toy_text_model
 from mbagent.rewards import RewardFn
@@ -135,7 +136,15 @@ def true_model(world: World) -> tuple[TransitionModel, RewardFn] | None:
     if world.kind == "rddl":
         model = RddlModel(tables_of(world.target))
         return model, model.reward
+    if world.kind == "minigrid":
+        tried = _snapshots(world.name)
+        return tried, tried.reward
     return None
+
+
+@cache
+def _snapshots(name: str) -> SnapshotModel:
+    return SnapshotModel(find_world(name).make())
 
 
 def scale_of(world: World) -> Scale:

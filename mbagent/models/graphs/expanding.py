@@ -14,6 +14,7 @@ from mbagent.models.compiled_model import Outcomes, implements, outcomes, work_f
 from mbagent.models.graphs.acts import Acts
 from mbagent.models.graphs.compiled import Bools, Floats, Ints, meets
 from mbagent.models.graphs.draws import settled
+from mbagent.models.graphs.laws import leave_out
 from mbagent.models.graphs.lean import (
     COUPLING,
     FIRST,
@@ -103,6 +104,7 @@ def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.u
     listed, values, coupled = work.units, work.values, work.coupled
     per_coupling, opened, base = work.per_coupling, work.opened, work.base
     p, acts = work.p, g.acts
+    counts, met, weights = g.counts, g.met, g.weights
     n_actions, first_meeting = len(always), len(columns) + acts.n_columns
     n_different = show_state(state, shown, columns, different, on)
     for m in range(len(meetings)):
@@ -121,6 +123,8 @@ def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.u
             listed[:n], units, members, exactly, values, rates, joint, coupled, per_coupling, opened, p, base, grid
         )
         _write(total, n_live, n_open, ended, base, opened, coupled, units, members, p, n_grid, out)
+        if len(counts) or len(met):
+            n_live = leave_out(counts, met, weights, cells, state, out.states, out.terminated, out.probabilities, total, n_live)
         out.counts[action] = n_live
         total += n_live
     for i in range(n_different):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mbagent.models.graphs.acts import Acts
 from mbagent.models.graphs.compiled import Graphs, linked, n_columns
+from mbagent.models.graphs.laws import LAWLESS, Laws, radix
 from mbagent.models.graphs.units import Layout, coupled_layout, lay_out
 from mbagent.models.graphs.windows import ACTION, BORDER, MEETING, NEXT, NEXT_MEETING, WRAP
 from mbagent.spaces import PlaneLayout
@@ -59,6 +60,7 @@ class LocalGraphs:
         cardinalities: number of values of each channel's cells, length C.
         acts: the actions.
         couplings: bits of which at most one is on.
+        laws: what every state keeps to.
     """
 
     graphs: Graphs
@@ -67,6 +69,7 @@ class LocalGraphs:
     cardinalities: tuple[int, ...]
     acts: Acts
     couplings: tuple[Coupling, ...]
+    laws: Laws = LAWLESS
 
 
 def instantiate(local: LocalGraphs, board: PlaneLayout) -> tuple[Layout, Graphs, Graphs]:
@@ -81,13 +84,19 @@ def instantiate(local: LocalGraphs, board: PlaneLayout) -> tuple[Layout, Graphs,
     meetings, later = (used[local.columns[used, 0] == kind] for kind in (MEETING, NEXT_MEETING))
     layout = lay_out([int(c) for c in cardinalities], (), local.acts, ordinal=False)
     now, then = (np.ascontiguousarray(local.columns[numbers, 1:]) for numbers in (meetings, later))
-    layout = with_couplings(layout._replace(cells=cells, meetings=now, next_meetings=then), local.couplings)
+    layout = layout._replace(cells=cells, meetings=now, next_meetings=then, weights=radix(local.cardinalities))
+    layout = with_couplings(with_laws(layout, local.laws), local.couplings)
     numbers = {int(d): len(layout.factor) + layout.acts.n_columns + i for i, d in enumerate(meetings)}
     numbers |= {int(d): n_columns(layout) + len(layout.factor) + i for i, d in enumerate(later)}
     graphs, late = (_Board(local, layout, numbers).graphs(which) for which in (local.graphs, local.late))
     units = [layout.cells[c].ravel() if c < len(cells) else np.asarray([n_factors]) for c in local.late.changing]
     order = np.concatenate([*units, np.zeros(0, dtype=np.int64)])
     return layout, graphs, late._replace(changing=order[layout.coupling_of[order] < 0])
+
+
+def with_laws(layout: Layout, laws: Laws) -> Layout:
+    """The layout with other laws."""
+    return layout._replace(counts=laws.counts, met=laws.met)
 
 
 def with_couplings(layout: Layout, couplings: Sequence[Coupling]) -> Layout:

@@ -49,7 +49,7 @@ class Lean(NamedTuple):
         row: where each factor's values begin among the rows, int64 [F + 1].
         shown: where each factor's columns begin, int64 [F + 1].
         columns: the lowest and highest value for which each is on, int64 [D, 2].
-        cells, meetings: see ``units.Layout``.
+        cells, meetings, counts, met, weights: see ``units.Layout``.
         touched: units that a factor's value touches, as bits, uint64 [A or 1, R, W].
         by_meeting: the same of meetings, uint64 [A or 1, M, W].
         always: units that do something even where everything is 0, uint64 [A, W].
@@ -72,6 +72,9 @@ class Lean(NamedTuple):
     columns: Ints
     cells: Ints
     meetings: Ints
+    counts: Ints
+    met: Bools
+    weights: Ints
     touched: Words
     by_meeting: Words
     always: Words
@@ -118,6 +121,9 @@ def lean(layout: Layout, graphs: Graphs, cardinalities: tuple[int, ...]) -> Lean
         columns=np.stack([layout.value, layout.top], axis=1),
         cells=layout.cells,
         meetings=layout.meetings,
+        counts=layout.counts,
+        met=layout.met,
+        weights=layout.weights,
         touched=touched,
         by_meeting=by_meeting,
         always=always,

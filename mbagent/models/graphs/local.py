@@ -18,7 +18,8 @@ from mbagent.models.graphs.channels import find_couplings, learn_channels, learn
 from mbagent.models.graphs.compiled import Graphs, build, habit_of
 from mbagent.models.graphs.evidence import Ints
 from mbagent.models.graphs.fitting import Fitted, nothing_late
-from mbagent.models.graphs.instantiate import Coupling, LocalGraphs, instantiate, with_couplings
+from mbagent.models.graphs.instantiate import Coupling, LocalGraphs, instantiate, with_couplings, with_laws
+from mbagent.models.graphs.laws import LAWLESS, Laws, all_kept, find_laws, n_combinations
 from mbagent.models.graphs.looks import PlaneTable, channel_layout
 from mbagent.models.graphs.model import FORETOLD, DecisionGraphModel
 from mbagent.models.graphs.parents import asked_columns, hangs_on_action
@@ -29,6 +30,9 @@ from mbagent.models.graphs.windows import NEXT, NEXT_MEETING, Reach, named_colum
 from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, thinned
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.transitions import TransitionBatch, TransitionDataset
+
+IMAGINED_STEPS = 5
+"""Steps of imagined play that show which laws would be broken."""
 
 LARGEST_RADIUS = 3
 """Neighbourhoods are tried up to this radius."""
@@ -94,6 +98,7 @@ class LocalGraphModel(DecisionGraphModel):
             progress(0.5)
         exact, (variables, calibration) = self._exact_match(held_out), self._described(held_out)
         self._learn(rows, jointly, since)
+        self._keep_laws(rows)
         if progress is not None:
             progress(1.0)
         figures = {"nodes": float(len(self.local.graphs.column)), "couplings": float(len(self.local.couplings))}
@@ -171,7 +176,7 @@ class LocalGraphModel(DecisionGraphModel):
         planes = PlaneTable(rows, self.board, local.cardinalities, local.columns, self.acts, since, in_pairs)
         self.searched, self.counted = len(planes.rows), len(planes.every_action)
         graphs, asked, found = learn_channels(planes)
-        self.local = replace(local, graphs=graphs, late=nothing_late(graphs), couplings=())
+        self.local = replace(local, graphs=graphs, late=nothing_late(graphs), couplings=(), laws=LAWLESS)
         self._instantiate((), ())
         some = thinned(rows, SOME_ROWS)
         couplings = find_couplings(rows, self.board, local.cardinalities, some, self._ones(some))
@@ -184,6 +189,21 @@ class LocalGraphModel(DecisionGraphModel):
         if len(late.changing):
             self.local = replace(self.local, late=late)
             self._instantiate((*asked, *more_asked), (*found, *more_found))
+
+    def _keep_laws(self, rows: TransitionBatch) -> None:
+        """Keeps to laws of the transitions that imagined play would break."""
+        laws, layout, rng = find_laws(rows, self.board, self.local.cardinalities), self.fitted.layout, np.random.default_rng(0)
+        each = [*(LAWLESS._replace(counts=laws.counts[k : k + 1]) for k in range(len(laws.counts)))]
+        each += [LAWLESS._replace(met=laws.met)]
+        broken, states = np.zeros(len(each), dtype=np.bool_), thinned(rows, SOME_ROWS).states
+        for _ in range(0 if laws.none else IMAGINED_STEPS):
+            following, over = self.sample(states, rng.integers(self.n_actions, size=len(states)), rng)
+            for i, law in enumerate(each):
+                broken[i] |= not (over | all_kept(*law, layout.weights, layout.cells, states, following)).all()
+            states = following[~over]
+        laws = Laws(laws.counts[broken[:-1]], laws.met if broken[-1] else LAWLESS.met)
+        self.local = replace(self.local, laws=laws)
+        self.fitted = replace(self.fitted, layout=with_laws(layout, laws))
 
     def _ones(self, rows: TransitionBatch) -> Floats:
         """Probability of each cell's value 1, [N, C, H, W]."""
@@ -216,6 +236,7 @@ class LocalGraphModel(DecisionGraphModel):
         """See TransitionModel."""
         couplings = np.asarray(self.local.couplings, dtype=np.int64).reshape(-1, 4)
         state: dict[str, NDArray[Any]] = {"reach": np.asarray(self.reach, dtype=np.int64), "couplings": couplings}
+        state |= self.local.laws._asdict()
         for name, graphs in (("local", self.local.graphs), ("late", self.local.late)):
             state.update({f"{name}.{part}": array for part, array in to_arrays(graphs).items()})
         return state
@@ -227,7 +248,7 @@ class LocalGraphModel(DecisionGraphModel):
             ValueError: the arrays are not those of a model of these planes and actions; nothing is changed then.
         """
         graph_parts = {f"{name}.{part}" for name in ("local", "late") for part in Graphs._fields}
-        wrong = sorted(({"reach", "couplings"} | graph_parts) ^ set(state))
+        wrong = sorted(({"reach", "couplings", "counts", "met"} | graph_parts) ^ set(state))
         if wrong:
             raise ValueError(f"These weights are not those of local decision graphs (first difference: {wrong[0]!r}).")
         cards, parts = self.local.cardinalities, np.asarray(state["reach"]).reshape(-1)
@@ -252,7 +273,12 @@ class LocalGraphModel(DecisionGraphModel):
             for c in couplings
         ):
             raise ValueError("These weights couple cells that these planes do not have; load them into a model of the same kind.")
-        self.local, self.reach = LocalGraphs(graphs, late, columns, cards, self.acts, couplings), reach
+        laws = Laws(table_of(state["counts"], 2), np.array(state["met"], dtype=np.bool_).reshape(-1))
+        if any(c not in range(len(cards)) or value not in range(cards[c]) for c, value in laws.counts) or (
+            len(laws.met) not in (0, n_combinations(cards))
+        ):
+            raise ValueError("These weights count values that these planes do not have; load them into a model of the same kind.")
+        self.local, self.reach = LocalGraphs(graphs, late, columns, cards, self.acts, couplings, laws), reach
         self._instantiate((), ())
 
 

@@ -16,8 +16,9 @@ from mbagent.models.base import (
     as_keys,
 )
 from mbagent.models.graphs import draws
-from mbagent.models.graphs.compiled import Graphs
+from mbagent.models.graphs.compiled import Graphs, Ints
 from mbagent.models.graphs.fitting import Fitted, nothing_late
+from mbagent.models.graphs.laws import COVERING, MOST_TRIES, Laws, all_kept, kept_chances, lawful
 from mbagent.models.graphs.lean import Lean
 from mbagent.models.graphs.listing import mixed, successors
 from mbagent.models.graphs.whole import WholeKernel, kernel_of
@@ -26,6 +27,9 @@ from mbagent_envs.random_keys import derive, uniforms
 
 _EVENT = 1 << 33
 """Salt of the random number that decides whether the event happens."""
+
+_AGAIN = 1 << 34
+"""Salt of the random numbers of the first repeated draw."""
 
 
 class GraphPredictions(BaseTransitionModel):
@@ -43,6 +47,15 @@ class GraphPredictions(BaseTransitionModel):
         if self._kernel is None or self._kernel[0] is not self.fitted:
             self._kernel = self.fitted, kernel_of(self.fitted, self.cardinalities)
         return self._kernel[1]
+
+    @property
+    def _laws(self) -> Laws:
+        return Laws(self.fitted.layout.counts, self.fitted.layout.met)
+
+    @property
+    def _cells(self) -> tuple[Ints, Ints]:
+        """What the laws are about: see ``laws.keeps``."""
+        return self.fitted.layout.weights, self.fitted.layout.cells
 
     def _rows(self, states: States, actions: Actions) -> tuple[States, Actions]:
         states, actions = np.ascontiguousarray(states, dtype=np.int64), np.ascontiguousarray(actions, dtype=np.int64)
@@ -62,7 +75,15 @@ class GraphPredictions(BaseTransitionModel):
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
         """See TransitionModel."""
         states, actions = self._rows(states, actions)
-        return self._draw(states, actions, as_keys(rng, len(states)))
+        keys = as_keys(rng, len(states))
+        following, over = self._draw(states, actions, keys)
+        for again in range(0 if self._laws.none else MOST_TRIES):
+            wrong = np.flatnonzero(~over & ~all_kept(*self._laws, *self._cells, states, following))
+            if len(wrong) == 0:
+                break
+            redrawn, ends = self._draw(states[wrong], actions[wrong], derive(keys[wrong], _AGAIN + again))
+            following[wrong[~ends]] = redrawn[~ends]  # whether the episode ends is drawn once
+        return following, over
 
     def _draw(self, states: States, actions: Actions, keys: Keys, greedy: bool = False) -> tuple[States, Bools]:
         """Draws by keys, or takes the likeliest value of each unit."""
@@ -96,11 +117,19 @@ class GraphPredictions(BaseTransitionModel):
         return probs
 
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
-        """See TransitionModel; exact for the distribution that ``sample`` draws from."""
+        """See TransitionModel; exact for the distribution that ``sample`` draws from.
+
+        Where there are laws (see ``laws.py``), the chance that all are kept is estimated from systematic draws.
+        """
         states, actions = self._rows(states, actions)
         following, over = np.ascontiguousarray(next_states, dtype=np.int64), np.ascontiguousarray(terminated, dtype=np.bool_)
         layout = self.fitted.layout
         usual: Floats = draws.log_prob(states, actions, following, over, layout, self.fitted.usual, self.fitted.late)
+        if not self._laws.none:
+            found = self._successors(states, actions, self.fitted.usual, self.fitted.late, COVERING, 0)
+            kept = all_kept(*self._laws, *self._cells, states, following)
+            chances = kept_chances(self._laws, *self._cells, states, found)
+            usual[~over] = np.where(kept, usual - np.log(chances), -np.inf)[~over]
         if not self.fitted.has_event:
             return usual
         rate = self._event_rates(states, actions)
@@ -115,7 +144,7 @@ class GraphPredictions(BaseTransitionModel):
         rates = self._event_rates(states, actions)
         happens = np.flatnonzero(rates >= 1.0 / n_samples)
         if len(happens) == 0:
-            return usual
+            return lawful(self._laws, *self._cells, states, usual)
         late = nothing_late(self.fitted.event)
         event = self._successors(states[happens], actions[happens], self.fitted.event, late, n_samples, seed)
         return mixed(usual, event, happens, rates)

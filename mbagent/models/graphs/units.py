@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mbagent.models.base import hash_rows
 from mbagent.models.graphs.acts import Acts, shown_acts
 from mbagent.models.graphs.evidence import Head
+from mbagent.models.graphs.laws import LAWLESS
 from mbagent.transitions import Factors
 from mbagent_envs.random_keys import derive
 
@@ -47,6 +48,8 @@ class Layout(NamedTuple):
         coupled: units, all bits, of which at most one is on after a step.
         exactly: whether it is exactly one, bool [Q].
         coupling_of: coupling that each unit is in, or -1, int64 [U].
+        counts, met: what planes keep to, see ``laws.py``.
+        weights: what each channel's value counts in the number of a combination, int64 [C].
     """
 
     outputs: Ints
@@ -64,6 +67,9 @@ class Layout(NamedTuple):
     coupled: Ints
     exactly: Bools
     coupling_of: Ints
+    counts: Ints
+    met: Bools
+    weights: Ints
 
 
 MOST_STEPS = 128
@@ -100,6 +106,8 @@ def lay_out(cardinalities: Sequence[int], groups: Sequence[Sequence[int]], acts:
         np.zeros(0, dtype=np.int64),
         np.zeros(0, dtype=np.bool_),
         np.full(len(sizes), -1, dtype=np.int64),
+        *LAWLESS,
+        np.zeros(0, dtype=np.int64),
     )
 
 

@@ -10,6 +10,7 @@ from mbagent.models.compiled_model import Outcomes, implements, outcomes, work_f
 from mbagent.models.graphs import expanding as expanding  # its overloads
 from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, distributions, n_columns, show
 from mbagent.models.graphs.fitting import Fitted, nothing_late
+from mbagent.models.graphs.laws import leave_out
 from mbagent.models.graphs.lean import Lean, lean
 from mbagent.models.graphs.listing import successors
 from mbagent.models.graphs.units import Layout
@@ -110,6 +111,19 @@ def whole_outcomes(
             a = action
             rare = successors(states[:1], actions[a : a + 1], layout, kernel.event, kernel.event_late, n_grid, key, offset)
             n += _take(rare[1], rare[2], rare[3], rare[4], rate, n_grid, total + n, out)
+        if len(layout.counts) or len(layout.met):
+            n = leave_out(
+                layout.counts,
+                layout.met,
+                layout.weights,
+                layout.cells,
+                state,
+                out.states,
+                out.terminated,
+                out.probabilities,
+                total,
+                n,
+            )
         out.counts[action] = n
         total += n
     return total
