@@ -191,7 +191,7 @@ class ModelLearningAgent(PrunableAlgorithm):
         """A transition model and a learned reward, both new, of these factors."""
         model, n, parts, rate = self.model_name, acts.n, acts.factored.cardinalities, check_learning_rate(self.lr_schedule(1.0))
         model = build_model(model, space, n, rate, parts) if isinstance(model, str) else fitting_model(model, space, n)
-        return model, LearnedReward(space.cardinalities, n, space.planes, seed=self._planning_seed)
+        return model, LearnedReward(space.cardinalities, n, space.planes, seed=self._planning_seed, parts=parts)
 
     def _recode(self, space: FactoredSpace) -> None:
         """Factors whose values are those of ``space``; where that changes anything, nothing is learned in them yet."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mbagent.models.base import Actions, Floats, States, hash_rows
+from mbagent.models.graphs.transition_classes import ClassGraphs, cells_in, check_graphs, class_chances, learn_classes
 from mbagent.models.networks import Affine, FactorCodec
 from mbagent.models.planes import Convolution, cells_of
 from mbagent.models.reward_kernel import DenseReward, pack_reward, reward_outputs
@@ -22,6 +23,9 @@ from mbagent.transitions import TransitionBatch
 
 MAX_CLASSES = 64
 """Up to this many distinct rewards are told apart as classes; more are met by regression."""
+
+MAX_GRAPHS = 16
+"""Up to this many distinct rewards are told apart by decision graphs, where these do better than a network."""
 
 STEPS, BATCH, LEARNING_RATE = 1500, 256, 0.01
 
@@ -69,20 +73,31 @@ class RewardReport:
 
 
 class LearnedReward:
-    """Predicts the reward of (state, action, next state).
+    """Predicts the reward of (state, action, next state): by decision graphs where these tell rewards apart, else by a network.
 
     Args:
         cardinalities: number of values of each state factor.
         n_actions: number of enumerated actions.
         planes: layout of the factors, where they form planes.
         seed: of weights and batches.
+        parts: number of values of each part of an action; None: an action is one thing.
     """
 
-    def __init__(self, cardinalities: tuple[int, ...], n_actions: int, planes: PlaneLayout | None = None, seed: int = 0) -> None:
+    def __init__(
+        self,
+        cardinalities: tuple[int, ...],
+        n_actions: int,
+        planes: PlaneLayout | None = None,
+        seed: int = 0,
+        parts: Sequence[int] | None = None,
+    ) -> None:
         """See the class."""
         self._codec, self._planes, self._seed = FactorCodec(cardinalities, n_actions), planes, seed
+        self._parts = (n_actions,) if parts is None else tuple(parts)
         self._values = np.zeros(1)
         self._classes = True
+        self._graphs: ClassGraphs | None = None
+        self._order = np.zeros(1)
         self._build()
 
     def _build(self) -> None:
@@ -101,6 +116,7 @@ class LearnedReward:
         values = np.unique(rows.rewards)
         self._classes = len(values) <= MAX_CLASSES
         self._values = values if self._classes else np.array([values.mean(), max(values.std(), 1e-6)])
+        self._graphs = None
         self._build()
         held_out, (distinct, weights) = float("nan"), _distinct(rows)
         if len(values) > 1:
@@ -108,12 +124,43 @@ class LearnedReward:
             chosen = np.random.default_rng(self._seed).permutation(episodes)[: int(HELD_OUT * len(episodes))]
             held = np.isin(rows.episodes, chosen)
             if held.any():
-                first, first_weights = _distinct(rows.select(np.flatnonzero(~held)))
-                self._train(first, torch.from_numpy(first_weights), STEPS)
-                held_out = self._share_right(rows.select(np.flatnonzero(held)))
-            self._train(distinct, torch.from_numpy(weights), STEPS // 2 if held.any() else STEPS)
+                held_out = self._choose(rows.select(np.flatnonzero(~held)), rows.select(np.flatnonzero(held)))
+            if self._graphs is not None or not held.any():
+                self._graphs = self._as_graphs(rows)
+            if self._graphs is None or (not held.any() and self._share_right(distinct, weights) < 1.0):
+                self._graphs = None
+                self._train(distinct, torch.from_numpy(weights), STEPS // 2 if held.any() else STEPS)
         right = self._share_right(distinct, weights)
         return RewardReport(len(values), right, held_out, _contrary(rows))
+
+    def _choose(self, train: TransitionBatch, tests: TransitionBatch) -> float:
+        """Learns from some rows in the way that does better on others; returns the share of those that it gets right."""
+        self._graphs, error, right = self._as_graphs(train), np.inf, 0.0
+        if self._graphs is not None:
+            error, right = self._error(tests), self._share_right(tests)
+        if right < 1.0:
+            graphs, self._graphs = self._graphs, None
+            distinct, weights = _distinct(train)
+            self._train(distinct, torch.from_numpy(weights), STEPS)
+            if error <= self._error(tests):
+                self._graphs = graphs
+            else:
+                right = self._share_right(tests)
+        return right
+
+    def _as_graphs(self, rows: TransitionBatch) -> ClassGraphs | None:
+        """Decision graphs for the rewards of some rows; None where there are too many different ones."""
+        if not self._classes or len(self._values) > MAX_GRAPHS:
+            return None
+        number = np.searchsorted(self._values, rows.rewards)
+        common = int(np.bincount(number, minlength=len(self._values)).argmax())
+        order = np.concatenate([[common], np.delete(np.arange(len(self._values)), common)])
+        self._order = self._values[order]
+        return learn_classes(rows, np.argsort(order)[number], self._codec.cardinalities, self._parts, self._planes)
+
+    def _error(self, rows: TransitionBatch) -> float:
+        """Mean squared error."""
+        return float(np.mean((self(rows.states, rows.actions, rows.next_states) - rows.rewards) ** 2))
 
     def _share_right(self, rows: TransitionBatch, weights: NDArray[np.float32] | None = None) -> float:
         reach = float(np.ptp(self._values)) if self._classes else 6.0 * float(self._values[1])
@@ -152,6 +199,9 @@ class LearnedReward:
         """Expected rewards float64 [M]; a row's value does not depend on the rows beside it."""
         if len(self._values) == 1:
             return np.full(len(actions), self._values[0])
+        if self._graphs is not None:
+            parts_of = (np.ascontiguousarray(part, dtype=np.int64) for part in (states, actions, next_states))
+            return self._weighed(class_chances(self._graphs, len(self._order), *parts_of), self._order)
         if self._packed is not None:
             return self._expected(torch.from_numpy(reward_outputs(self._packed, states, actions, next_states))).numpy()
         parts = [np.zeros(0)]
@@ -167,20 +217,39 @@ class LearnedReward:
     def _expected(self, out: Tensor) -> Tensor:
         if not self._classes:
             return out[:, 0].double() * float(self._values[1]) + float(self._values[0])
-        p = out.double().softmax(dim=1)
-        p = torch.where(p < 0.01, 0.0, p)
+        return torch.from_numpy(self._weighed(out.double().softmax(dim=1).numpy(), self._values))
+
+    @staticmethod
+    def _weighed(chances: Floats, values: Floats) -> Floats:
+        """Expected values [M] by chances [M, K]; of which those below 1% count as none."""
+        p = np.where(chances < 0.01, 0.0, chances)
         # Not a matrix product: it would round differently for other numbers of rows.
-        return (p / p.sum(dim=1, keepdim=True) * torch.from_numpy(self._values)).sum(dim=1)
+        expected: Floats = (p / p.sum(axis=1, keepdims=True) * values).sum(axis=1)
+        return expected
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """All weights, as arrays."""
-        weights = {f"network.{name}": value.numpy().copy() for name, value in self._network.state_dict().items()}
-        return {"values": self._values.copy(), "classes": np.array(self._classes), **weights}
+        known = {"values": self._values.copy(), "classes": np.array(self._classes)}
+        if self._graphs is not None:
+            graphs = {f"graphs.{name}": array.copy() for name, array in self._graphs._asdict().items()}
+            return {**known, "order": self._order.copy(), **graphs}
+        return known | {f"network.{name}": value.numpy().copy() for name, value in self._network.state_dict().items()}
 
     def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Takes over what ``state_dict`` returned."""
+        """Takes over what ``state_dict`` returned.
+
+        Raises:
+            ValueError: the arrays are not those of such a reward.
+        """
         self._values, self._classes = np.array(state["values"]), bool(state["classes"])
+        self._graphs = None
         self._build()
+        if "order" in state:
+            self._order = np.array(state["order"], dtype=np.float64).reshape(-1)
+            own = {name.removeprefix("graphs."): array for name, array in state.items() if name.startswith("graphs.")}
+            cards, n_actions = self._codec.cardinalities, self._codec.n_actions
+            self._graphs = check_graphs(own, cards, n_actions, len(self._order), cells_in(self._planes, len(cards)))
+            return
         prefix = "network."
         weights = {k.removeprefix(prefix): torch.tensor(np.asarray(v)) for k, v in state.items() if k.startswith(prefix)}
         self._network.load_state_dict(weights)

@@ -3,11 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mbagent.learned_reward import LearnedReward
 from mbagent.models.networks import FactorCodec
 from mbagent.models.reward_kernel import DenseReward, pack_reward, reward_outputs
+from mbagent.spaces import FactoredSpace
 from mbagent.transitions import TransitionBatch
 
 
@@ -65,6 +67,66 @@ def test_one_reward_needs_no_learning() -> None:
     assert np.isnan(report.held_out)
     assert report.advice is None
     assert model(np.zeros((1, 4), int), np.zeros(1, int), np.zeros((1, 4), int))[0] == -1.0
+
+
+def test_one_cause_is_found_among_very_many_bits_from_few_steps() -> None:
+    rng, n = np.random.default_rng(0), 300
+    states, after, actions = *rng.integers(2, size=(2, n, 62)), rng.integers(4, size=n)
+    ends = np.zeros(n, dtype=np.bool_)
+    model = LearnedReward((2,) * 62, 4)
+    report = model.fit(TransitionBatch(states, actions, after, ends, (actions == 0) * 1.0, np.arange(n) // 20))
+    assert report.right == report.held_out == 1.0
+    others = rng.integers(2, size=(2, 40, 62))
+    np.testing.assert_array_equal(model(others[0], np.arange(40) % 4, others[1]), np.arange(40) % 4 == 0)
+
+
+def pictures(n: int, seed: int = 0) -> TransitionBatch:
+    """A coin (channel 0) and a player (channel 1) on a 5 by 5 board; meeting pays 1, but under action 1 costs 2."""
+    rng = np.random.default_rng(seed)
+    boards = np.zeros((2, n, 2, 25), dtype=np.int64)
+    for board in boards:
+        for channel in range(2):
+            board[np.arange(n), channel, rng.integers(25, size=n)] = 1
+    before, after = boards.reshape(2, n, 50)
+    actions = rng.integers(2, size=n)
+    met = (after.reshape(n, 2, 25).sum(axis=1) == 2).any(axis=1)
+    return TransitionBatch(before, actions, after, np.zeros(n, dtype=np.bool_), met * (1.0 - 3.0 * actions), np.arange(n) // 20)
+
+
+def test_on_planes_what_meets_what_is_found_wherever_it_is() -> None:
+    planes = FactoredSpace(spaces.MultiBinary((2, 5, 5))).planes
+    model = LearnedReward((2,) * 50, 2, planes)
+    assert model.fit(pictures(3000)).right == 1.0
+    tests = pictures(500, 1)
+    found = model(tests.states, tests.actions, tests.next_states)
+    np.testing.assert_array_equal(found, tests.rewards)
+    assert model(tests.states[7:8], tests.actions[7:8], tests.next_states[7:8])[0] == found[7]
+    other = LearnedReward((2,) * 50, 2, planes)
+    weights = model.state_dict()
+    other.load_state_dict(weights)
+    np.testing.assert_array_equal(other(tests.states, tests.actions, tests.next_states), found)
+    far = weights["graphs.columns"].copy()
+    far[:, 1] = 99
+    for name, array in (
+        ("graphs.columns", far),
+        ("graphs.first", weights["graphs.first"] + 10_000),
+        ("graphs.node", weights["graphs.node"] + 1),
+        ("graphs.ways", weights["graphs.ways"][:1]),
+        ("graphs.rate", weights["graphs.rate"] + 2.0),
+        ("graphs.cells", weights["graphs.cells"][:, :4]),
+    ):
+        with pytest.raises(ValueError, match="not those of a learned reward"):
+            other.load_state_dict({**weights, name: array})
+
+
+def test_sums_of_many_things_are_left_to_a_network() -> None:
+    rng, n = np.random.default_rng(0), 2000
+    states, after = rng.integers(2, size=(2, n, 12))
+    ends, actions = np.zeros(n, dtype=np.bool_), rng.integers(2, size=n)
+    model = LearnedReward((2,) * 12, 2)
+    report = model.fit(TransitionBatch(states, actions, after, ends, after.sum(axis=1) * 1.0, np.arange(n) // 20))
+    assert report.held_out > 0.9
+    assert not any(name.startswith("graphs.") for name in model.state_dict())
 
 
 def test_weights_come_back() -> None:

@@ -63,7 +63,7 @@ class Graphs(NamedTuple):
     still: Floats
 
 
-class _Nodes:
+class Nodes:
     """Nodes of all graphs while they are built."""
 
     def __init__(self) -> None:
@@ -71,6 +71,7 @@ class _Nodes:
         self.rates: list[tuple[float, float]] = []
 
     def add(self, column: int, off: int, on: int, rate: float = 0.0, spread: float = 0.0) -> int:
+        """Adds a node; returns its number."""
         self.links.append((column, off, on))
         self.rates.append((rate, spread))
         return len(self.links) - 1
@@ -112,7 +113,7 @@ def build(layout: Layout, asked: Sequence[Question], found: Sequence[Search], ha
         habits: of each unit.
         still: probability that a unit without graphs changes.
     """
-    nodes, prior = _Nodes(), best_prior(found)
+    nodes, prior = Nodes(), best_prior(found)
     pairs = np.concatenate([[0], np.cumsum(layout.acts.n_ways * layout.outputs)]).astype(np.int64)
     entries = [np.zeros((0, 3), dtype=np.int64)]
     for question, search in zip(asked, found, strict=True):
