@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.base import Actions, Bools, States
-from mbagent.steering import find_steered
+from mbagent.steering import View, find_reached, find_steered
 from mbagent.transitions import TransitionBatch, TransitionDataset
 from mbagent.visits import START, VisitTable
 
-FEW_STATES, STEPS_PER_STATE = 64, 8
+FEW_STATES, STEPS_PER_STATE = 64, 4
 """States are few enough for a table where there are so many at most, and one more for each so many steps."""
 
 MANY_STATES = 50_000
@@ -105,9 +105,9 @@ class DirectedExploration:
     """To what was tried least, by counts over the states met; where there are too many states, every action equally often.
 
     Where random steps seldom get far (holes, cliffs, long corridors, things that take several steps in the right order), it is
-    far ahead of them. It needs states that are met again: a table of visits says nothing about a state never seen. Where there are
-    too many of them, it looks again each time the steps have doubled whether they are few in the factors that actions have a say
-    in (see mbagent.steering), and counts in these alone: lights that flicker whatever is done make every state a new one, and do
+    far ahead of them. It needs states that are met again: a table of visits says nothing about a state never seen. Where there
+    are too many of them, it looks again each time the steps have doubled whether they are few in what actions have a say in
+    (see mbagent.steering), and counts in that alone: lights that flicker whatever is done make every state a new one, and do
     not matter for where to go.
 
     Args:
@@ -117,14 +117,14 @@ class DirectedExploration:
 
     Attributes:
         table: what was tried; None where there were more than MANY_STATES, until fewer factors are found to tell them apart by.
-        factors: numbers of the factors that states are told apart by, int64; None for all.
+        view: what states are told apart by; None for all that they are.
         n_steps: steps observed.
     """
 
     def __init__(self, n_actions: int, few: bool = False) -> None:
         """See the class."""
         self.table: VisitTable | None = VisitTable(n_actions)
-        self.factors: NDArray[np.int64] | None = None
+        self.view: View | None = None
         self.n_steps = 0
         self._few, self._random = few, RandomExploration(n_actions)
         self._uncounted: list[_Steps] = []
@@ -180,8 +180,8 @@ class DirectedExploration:
             self._look_at = 2 * self.n_steps
             self._look()
 
-    def _nodes(self, table: VisitTable, states: States) -> NDArray[np.int64]:
-        return table.add(states if self.factors is None else states[:, self.factors])
+    def _nodes(self, table: VisitTable, states: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
+        return table.add(states.astype(np.int64, copy=False) if self.view is None else self.view(states))
 
     def _count(self, table: VisitTable, steps: _Steps) -> None:
         """Enters steps into the table."""
@@ -202,36 +202,33 @@ class DirectedExploration:
             self._kept = None
 
     def _look(self) -> None:
-        """Settles by which factors states are told apart: by all, if they are few then; else by those that actions reach."""
-        if self._kept is None or (self.factors is None and self.directed):
+        """Settles how states are told apart: by all, if they are few then; else by what actions reach; else by what they do."""
+        if self._kept is None or (self.view is None and self.directed):
             return
         steps = _joined(self._kept)
         self._kept = [steps]
-        for factors in self._choices(steps):
-            if _distinct(steps.states if factors is None else steps.states[:, factors]) <= self._most:
-                break
+        if _distinct(steps.states) <= self._most:
+            view = None
         else:
-            return
-        if self.table is None or not _same(factors, self.factors):
-            self.factors, self.table = factors, VisitTable(self._random.n_actions)
+            met = steps.states, steps.actions, steps.next_states
+            found = find_steered(*met, self._random.n_actions)
+            view = View(found, np.zeros_like(found.directly))
+            if not found.directly.any() or _distinct(view(steps.states)) > self._most:
+                return
+            finer = View(found, find_reached(found, *met))
+            view = finer if _distinct(finer(steps.states)) <= self._most else view
+        if self.table is None or not (view.same_as(self.view) if view is not None else self.view is None):
+            self.view, self.table = view, VisitTable(self._random.n_actions)
             self._uncounted, self._n_uncounted = [], 0
             self._count(self.table, steps)
-
-    def _choices(self, steps: _Steps) -> Iterator[NDArray[np.int64] | None]:
-        """What states may be told apart by, the most first; a set of factors that no action reaches is none."""
-        yield None
-        found = find_steered(steps.states, steps.actions, steps.next_states, self._random.n_actions)
-        if found.directly.any():
-            for some in (found.at_all | found.rare, found.directly | found.rare, found.directly):
-                yield np.flatnonzero(some)
 
 
 class _Steps(NamedTuple):
     """Steps [N]: states int [N, F], actions, next states, whether an episode ended with it, and began with it."""
 
-    states: States
+    states: NDArray[np.integer[Any]]
     actions: Actions
-    next_states: States
+    next_states: NDArray[np.integer[Any]]
     ended: Bools
     began: Bools
 
@@ -245,14 +242,10 @@ def _joined(parts: list[_Steps]) -> _Steps:
     return parts[0] if len(parts) == 1 else _Steps(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def _distinct(states: States) -> int:
+def _distinct(states: NDArray[np.integer[Any]]) -> int:
     """Number of distinct rows."""
     rows = np.ascontiguousarray(states)
     return len(np.unique(rows.view(np.dtype((np.void, rows.dtype.itemsize * rows.shape[1])))))
-
-
-def _same(some: NDArray[np.int64] | None, others: NDArray[np.int64] | None) -> bool:
-    return others is None if some is None else others is not None and np.array_equal(some, others)
 
 
 def catch_up(exploration: Exploration, data: TransitionDataset) -> None:

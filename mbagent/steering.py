@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, NamedTuple
+from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +15,12 @@ from numpy.typing import NDArray
 from mbagent.models.base import Actions, Bools, Floats, States
 
 Ints = NDArray[np.int64]
+Values = NDArray[np.integer[Any]]
 
 LOOKED_AT = 8192
 """Transitions that are looked at; of more, evenly chosen ones."""
 
-CELLS, CAUSES = 2048, 1024
+CELLS, CAUSES = 1024, 512
 """Changes, and values of other factors, that are set against each other at most: the most frequent ones."""
 
 SHARE = 0.1
@@ -27,21 +30,59 @@ SURE = 5.0
 """Log evidence, beyond the logarithm of the number of questions, from which on a dependence is believed."""
 
 RARE = 16
-"""A factor that changed less often multiplies the states met by little, and what it hangs on is not to be told yet."""
+"""What changed less often multiplies the states met by little, and what it hangs on is not to be told yet."""
 
 
-class Steered(NamedTuple):
+@dataclass(frozen=True)
+class Steered:
     """What was found of F factors.
 
     Attributes:
         directly: the next value hangs on the action, given the present one, bool [F].
-        at_all: so it does, or on a factor of which this is true, bool [F].
-        rare: changed less than RARE times, bool [F].
+        classes: of each factor that changed, the lowest value of the class that each of its values belongs to. Values of a class
+            change into each other often, but whatever is done.
     """
 
     directly: Bools
-    at_all: Bools
-    rare: Bools
+    classes: Mapping[int, Mapping[int, int]]
+
+
+class View:
+    """States as what matters of them: some factors as they are, of others only the class of each value.
+
+    Args:
+        found: what hangs on actions.
+        whole: factors whose values are told apart in any case, bool [F].
+    """
+
+    def __init__(self, found: Steered, whole: Bools) -> None:
+        """See the class."""
+        kept = whole.copy()
+        some: list[int] = []
+        for factor, classes in found.classes.items():
+            n_classes = len(set(classes.values()))
+            kept[factor] |= n_classes == len(classes)
+            if 1 < n_classes < len(classes) and not kept[factor]:
+                some.append(factor)
+        self.factors, self.some = np.flatnonzero(kept), np.array(some, dtype=np.int64)
+        width = max((max(found.classes[factor]) for factor in some), default=0) + 2  # the last for any that was never met
+        self.classes = np.repeat(np.arange(width)[None], len(some), axis=0)
+        for row, factor in enumerate(some):
+            for value, lowest in found.classes[factor].items():
+                self.classes[row, value] = lowest
+
+    def __call__(self, states: Values) -> States:
+        """What matters of states [B, F], int64 [B, K]."""
+        kept = states.take(self.factors, axis=1).astype(np.int64, copy=False)
+        if not len(self.some):
+            return kept
+        known = np.minimum(states.take(self.some, axis=1), self.classes.shape[1] - 1)
+        return np.concatenate([kept, self.classes[np.arange(len(self.some)), known]], axis=1)
+
+    def same_as(self, other: View | None) -> bool:
+        """Whether another tells the same states apart in the same words."""
+        names = ("factors", "some", "classes")
+        return other is not None and all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
 
 
 @dataclass(frozen=True)
@@ -51,86 +92,124 @@ class _Changes:
     Attributes:
         value: number of the present value of each row, int64 [N].
         cell: number of the row's cell, -1 where nothing changed, int64 [N].
-        start: the present value of each cell, int64 [C].
+        start: the present value's number for each cell, int64 [C].
+        ways: the present value and the next one of each cell, [C, 2].
     """
 
     value: Ints
     cell: Ints
     start: Ints
+    ways: Ints
 
 
-def find_steered(before: States, actions: Actions, after: States, n_actions: int) -> Steered:
-    """Which of F factors hang on actions.
+def thinned(before: Values, actions: Actions, after: Values, most: int = LOOKED_AT) -> tuple[Values, Actions, Values]:
+    """At most so many of some transitions, evenly chosen."""
+    if len(actions) <= most:
+        return before, actions, after
+    some = np.linspace(0, len(actions) - 1, most).astype(np.int64)
+    return before[some], actions[some], after[some]
+
+
+def find_steered(before: Values, actions: Actions, after: Values, n_actions: int) -> Steered:
+    """Which of F factors hang on actions, and which values not even then.
 
     Each change is taken for itself: whether its probability, given the factor's present value, is another one after some action
-    than after the rest, or beside some value of a steered factor than beside the rest. Beta-binomial evidence answers; of a factor's
-    changes, one must speak for itself, or many together.
+    than after the rest. Beta-binomial evidence answers; of a factor's changes, one must speak for itself, or many together.
 
     Args:
-        before, after: states [N, F], integers of any width.
+        before: states, integers of any width [N, F].
         actions: int64 [N].
+        after: next states, as ``before``.
         n_actions: number of actions A.
     """
-    if len(actions) > LOOKED_AT:
-        some = np.linspace(0, len(actions) - 1, LOOKED_AT).astype(np.int64)
-        before, actions, after = before[some], actions[some], after[some]
-    times = (before != after).sum(axis=0)
-    changes = {int(f): _changes_of(before[:, f], after[:, f]) for f in np.flatnonzero(times)}
-    n_cells = sum(len(change.start) for change in changes.values())
-    directly = np.zeros(before.shape[1], dtype=np.bool_)
+    before, actions, after = thinned(before, actions, after)
+    changes = _all_changes(before, after)
+    enough = SURE + math.log(n_actions * max(1, sum(len(change.start) for change in changes.values())))
+    directly, classes = np.zeros(before.shape[1], dtype=np.bool_), {}
     for factor, change in changes.items():
         n_values = int(change.value.max()) + 1
         of_value = np.bincount(change.value * n_actions + actions, minlength=n_values * n_actions).reshape(n_values, -1)
         moved = change.cell >= 0
         of_cell = np.bincount(change.cell[moved] * n_actions + actions[moved], minlength=len(change.start) * n_actions)
-        logs = _evidence(of_cell.reshape(-1, n_actions), of_value[change.start])
-        directly[factor] = _speaks(logs).max() > SURE + math.log(n_cells * n_actions)
-    at_all, new = directly.copy(), directly
-    while new.any() and (rest := [f for f in changes if not at_all[f] and times[f] >= RARE]):
-        found = _hanging({f: changes[f] for f in rest}, before, np.flatnonzero(new))
-        new = np.isin(np.arange(len(at_all)), found)
-        at_all |= new
-    return Steered(directly, at_all, times < RARE)
+        of_cell = of_cell.reshape(-1, n_actions)
+        logs = _evidence(of_cell, of_value[change.start])
+        directly[factor] = _speaks(logs).max() > enough
+        hanging = logs.max(axis=1) > (0.0 if directly[factor] else enough)
+        classes[factor] = _classes(change.ways, of_cell.sum(axis=1), hanging, before[:, factor], after[:, factor])
+    return Steered(directly, classes)
+
+
+def _classes(ways: Ints, times: Ints, hanging: Bools, *met: NDArray[Any]) -> dict[int, int]:
+    """The lowest value of each value's class; what changed too seldom to be told from what hangs on actions stays apart."""
+    both: dict[tuple[int, int], int] = {}
+    apart = {(min(pair), max(pair)) for pair in ways[hanging].tolist()}
+    for pair, n in zip(ways.tolist(), times.tolist(), strict=True):
+        key = min(pair), max(pair)
+        both[key] = both.get(key, 0) + n
+    lowest = {int(value): int(value) for value in np.unique(np.concatenate(met))}
+    for (low, high), n in sorted(both.items()):
+        if n >= RARE and (low, high) not in apart:
+            one, other = lowest[low], lowest[high]
+            merged = [value for value, name in lowest.items() if name in (one, other)]
+            if not any(pair in apart for pair in combinations(merged, 2)):
+                lowest.update(dict.fromkeys(merged, min(one, other)))
+    return lowest
+
+
+def find_reached(found: Steered, before: Values, actions: Actions, after: Values) -> Bools:
+    """Factors that hang on actions, or on others of which this is true, bool [F].
+
+    The latter is asked as ``find_steered`` asks: whether a change is more or less probable beside some value of the other factor.
+    """
+    before, _, after = thinned(before, actions, after, LOOKED_AT // 2)
+    changes, reached, new = _all_changes(before, after), found.directly.copy(), found.directly
+    rest = [f for f, change in changes.items() if not reached[f] and (change.cell >= 0).sum() >= RARE]
+    if not rest or not new.any():
+        return reached
+    of_values, kept_values = _columns([changes[f].value for f in rest], CELLS)
+    of_cells, kept_cells = _columns([changes[f].cell for f in rest], CELLS)
+    place = {(f, number): column for column, (f, number) in enumerate(kept_values.tolist())}
+    begun = np.array([place.get((f, int(changes[rest[f]].start[cell])), -1) for f, cell in kept_cells.tolist()])
+    of_cells, owner, begun = of_cells[:, begun >= 0], np.array(rest)[kept_cells[begun >= 0, 0]], begun[begun >= 0]
+    while new.any() and len(begun):
+        causes, _ = _columns([np.unique(before[:, f], return_inverse=True)[1] for f in np.flatnonzero(new)], CAUSES)
+        causes = np.column_stack([causes, np.ones(len(causes), dtype=np.float32)])  # the last column for all rows
+        n, k = (np.rint(columns.T @ causes).astype(np.int64) for columns in (of_values, of_cells))
+        logs = _evidence(k[:, :-1], n[begun, :-1], k[:, -1:], n[begun, -1:])
+        new = np.zeros_like(reached)
+        for f in np.unique(owner):
+            new[f] = not reached[f] and _speaks(logs[owner == f]).max() > SURE + math.log(logs.size)
+        reached |= new
+    return reached
+
+
+def _all_changes(before: NDArray[Any], after: NDArray[Any]) -> dict[int, _Changes]:
+    return {int(f): _changes_of(before[:, f], after[:, f]) for f in np.flatnonzero((before != after).any(axis=0))}
 
 
 def _changes_of(before: NDArray[Any], after: NDArray[Any]) -> _Changes:
     known, value = np.unique(before, return_inverse=True)
     moved, cell = np.flatnonzero(before != after), np.full(len(before), -1, dtype=np.int64)
     width = int(after.max()) + 1
-    pairs, number = np.unique(value[moved] * width + after[moved], return_inverse=True)
-    cell[moved] = number
-    return _Changes(value.astype(np.int64), cell, pairs // width)
-
-
-def _hanging(changes: dict[int, _Changes], before: States, causes: Ints) -> list[int]:
-    """Those factors whose changes hang on a value of one of the causes."""
-    shown = _columns([np.unique(before[:, f], return_inverse=True)[1] for f in causes], CAUSES)[0]
-    starts, cells = [c.value for c in changes.values()], [c.cell for c in changes.values()]
-    of_values, kept_values = _columns(starts, CELLS)
-    of_cells, kept_cells = _columns(cells, CELLS)
-    place = {pair: i for i, pair in enumerate(map(tuple, kept_values.tolist()))}
-    factors = list(changes)
-    begun = np.array([place.get((f, int(changes[factors[f]].start[c])), -1) for f, c in kept_cells.tolist()], dtype=np.int64)
-    kept_cells, of_cells, begun = kept_cells[begun >= 0], of_cells[:, begun >= 0], begun[begun >= 0]
-    if not len(begun) or not shown.shape[1]:
-        return []
-    n, k = (np.rint(columns.T @ np.column_stack([shown, np.ones(len(shown))])).astype(np.int64) for columns in (of_values, of_cells))
-    logs = _evidence(k[:, :-1], n[begun, :-1], k[:, -1:], n[begun, -1:])
-    enough = SURE + math.log(logs.size)
-    return [f for i, f in enumerate(factors) if (kept_cells[:, 0] == i).any() and _speaks(logs[kept_cells[:, 0] == i]).max() > enough]
+    pairs, cell[moved] = np.unique(value[moved] * width + after[moved], return_inverse=True)
+    start = pairs // width
+    return _Changes(value.astype(np.int64), cell, start, np.column_stack([known[start], pairs % width]).astype(np.int64))
 
 
 def _columns(numbers: list[Ints], most: int) -> tuple[NDArray[np.float32], Ints]:
-    """Indicators float32 [N, C] of the most frequent numbers, -1 left out, and for each column its row in the list and its number."""
+    """Indicators float32 [N, C] of the most frequent numbers but -1, and for each column its row in the list and its number."""
     found: list[tuple[int, int, int]] = []
     for i, row in enumerate(numbers):
         times = np.bincount(row[row >= 0])
         found += [(-int(times[number]), i, int(number)) for number in np.flatnonzero(times)]
     kept = np.array([entry[1:] for entry in sorted(found)[:most]], dtype=np.int64).reshape(-1, 2)
-    columns = np.empty((len(numbers[0]), len(kept)), dtype=np.float32)
-    for column, (i, number) in enumerate(kept.tolist()):
-        columns[:, column] = numbers[i] == number
-    return columns, kept
+    columns = np.zeros((len(numbers[0]), len(kept) + 1), dtype=np.float32)  # the last for those that are left out
+    for i in np.unique(kept[:, 0]):
+        place = np.full(int(numbers[i].max()) + 2, len(kept), dtype=np.int64)  # the last for -1
+        own = np.flatnonzero(kept[:, 0] == i)
+        place[kept[own, 1]] = own
+        columns[np.arange(len(columns)), place[numbers[i]]] = 1.0
+    return columns[:, :-1], kept
 
 
 @cache
@@ -152,14 +231,18 @@ def _evidence(k: Ints, n: Ints, all_k: Ints | None = None, all_n: Ints | None = 
     """Log evidence that changes [C, G], k among n, are more or less probable there than in the rest.
 
     Args:
-        k, n: changes and rows under each condition, int64 [C, G].
-        all_k, all_n: in all, int64 [C, 1]; None for the sums over conditions.
+        k: changes under each condition, int64 [C, G].
+        n: rows under each condition, int64 [C, G].
+        all_k: changes in all, int64 [C, 1]; None for the sum over conditions.
+        all_n: rows in all, as ``all_k``.
     """
-    all_k, all_n = (k.sum(axis=1, keepdims=True) if all_k is None else all_k), (n.sum(axis=1, keepdims=True) if all_n is None else all_n)
+    all_k = k.sum(axis=1, keepdims=True) if all_k is None else all_k
+    all_n = n.sum(axis=1, keepdims=True) if all_n is None else all_n
     return _chance(k, n) + _chance(all_k - k, all_n - n) - _chance(all_k, all_n)
 
 
 def _speaks(logs: Floats) -> Floats:
     """Log evidence [G] of a factor's changes [C, G], that one alone hangs on it, or a share of them."""
     together = np.logaddexp(math.log(1.0 - SHARE), math.log(SHARE) + logs).sum(axis=0)
-    return np.maximum(logs.max(axis=0), together)
+    result: Floats = np.maximum(logs.max(axis=0), together)
+    return result

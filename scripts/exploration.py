@@ -35,7 +35,7 @@ class Args:
     """Compare explorations."""
 
     worlds: tuple[str, ...] = ("FrozenLake 8x8", "CliffWalking", "Taxi")
-    """Which environments: those of the benchmark whose rules are known, or made-up ones (see mbagent.analysis.external.besides)."""
+    """Which environments: those of the benchmark whose rules are known, or made-up ones (analysis.external.besides)."""
     explorations: tuple[str, ...] = ("random", "auto")
     """Which explorations."""
     marks: tuple[int, ...] = (500, 1000, 2000, 5000, 10_000, 20_000)

@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.base import Actions, Bools, Floats, States, TransitionModel
+from mbagent.models.base import Actions, Bools, States, TransitionModel
 
 Ints = NDArray[np.int64]
 
@@ -82,7 +82,8 @@ class BesideWorld:
         taken = np.where(rng.random(n) < core.slip, rng.integers(core.going.shape[1], size=n), actions)
         target, over = core.going[numbers, taken], core.over[numbers, taken]
         same = (core.going[numbers] == target[:, None]) & (core.over[numbers] == over[:, None])
-        chances = core.slip * same.mean(axis=1) + (1.0 - core.slip) * same[np.arange(n), actions]
+        shares: NDArray[np.float64] = same.mean(axis=1)
+        chances = core.slip * shares + (1.0 - core.slip) * same[np.arange(n), actions]
         truth = np.log(chances) + np.where(flipped, np.log(FLICKER), np.log(1.0 - FLICKER)).sum(axis=1)
         before, after = np.hstack([core.values[numbers], bits]), np.hstack([core.values[target], bits ^ flipped])
         said = model.log_prob(before, actions, after, over)
