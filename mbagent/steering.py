@@ -114,7 +114,8 @@ def find_steered(before: Values, actions: Actions, after: Values, n_actions: int
     """Which of F factors hang on actions, and which values not even then.
 
     Each change is taken for itself: whether its probability, given the factor's present value, is another one after some action
-    than after the rest. Beta-binomial evidence answers; of a factor's changes, one must speak for itself, or many together.
+    than after the rest, always or where some other factor has some value. Beta-binomial evidence answers; of a factor's changes,
+    one must speak for itself, or many together.
 
     Args:
         before: states, integers of any width [N, F].
@@ -126,17 +127,49 @@ def find_steered(before: Values, actions: Actions, after: Values, n_actions: int
     changes = _all_changes(before, after)
     enough = SURE + math.log(n_actions * max(1, sum(len(change.start) for change in changes.values())))
     directly, classes = np.zeros(before.shape[1], dtype=np.bool_), {}
+    contexts = _in_contexts(changes, before, actions, n_actions)
     for factor, change in changes.items():
-        n_values = int(change.value.max()) + 1
-        of_value = np.bincount(change.value * n_actions + actions, minlength=n_values * n_actions).reshape(n_values, -1)
-        moved = change.cell >= 0
+        n_values, moved = int(change.value.max()) + 1, change.cell >= 0
+        pairs = change.value * n_actions + actions
+        of_value = np.bincount(pairs, minlength=n_values * n_actions).reshape(n_values, -1)
+        staying = np.bincount(pairs[~moved], minlength=n_values * n_actions).reshape(n_values, -1)
         of_cell = np.bincount(change.cell[moved] * n_actions + actions[moved], minlength=len(change.start) * n_actions)
         of_cell = of_cell.reshape(-1, n_actions)
         logs = _evidence(of_cell, of_value[change.start])
-        directly[factor] = _speaks(logs).max() > enough
-        hanging = logs.max(axis=1) > (0.0 if directly[factor] else enough)
-        classes[factor] = _classes(change.ways, of_cell.sum(axis=1), hanging, before[:, factor], after[:, factor])
+        directly[factor] = _speaks(logs).max() > enough or contexts[factor].any()
+        odds = _evidence(of_cell, of_cell + staying[change.start])  # one change must not look steered for another that is
+        hanging = contexts[factor] | (odds.max(axis=1) > enough / (1 + directly[factor]))
+        unsure = staying.sum(axis=1)[change.start] < RARE
+        classes[factor] = _classes(change.ways, of_cell.sum(axis=1), hanging | unsure, before[:, factor], after[:, factor])
     return Steered(directly, classes)
+
+
+def _in_contexts(changes: Mapping[int, _Changes], before: Values, actions: Actions, n_actions: int) -> dict[int, Bools]:
+    """For each factor, which of its cells hang on the action where some other factor has some value.
+
+    What comes from the left by one action and from the right by another does not hang on the action alone.
+    """
+    result, factors = {f: np.zeros(len(change.start), dtype=np.bool_) for f, change in changes.items()}, list(changes)
+    some = slice(None) if len(actions) <= LOOKED_AT // 2 else np.linspace(0, len(actions) - 1, LOOKED_AT // 2).astype(np.int64)
+    of_cells, kept = _columns([changes[f].cell[some] for f in factors], CELLS)
+    stays = [np.where(changes[f].cell[some] < 0, changes[f].value[some], -1) for f in factors]
+    of_values, kept_values = _columns(stays, CELLS)
+    place = {(f, number): column for column, (f, number) in enumerate(kept_values.tolist())}
+    begun = np.array([place.get((f, int(changes[factors[f]].start[cell])), -1) for f, cell in kept.tolist()], dtype=np.int64)
+    of_cells, kept, begun = of_cells[:, begun >= 0], kept[begun >= 0], begun[begun >= 0]
+    causes, _ = _columns([np.unique(before[some, f], return_inverse=True)[1] for f in factors], CAUSES, even=True)
+    if not len(begun) or not causes.shape[1]:
+        return result
+    chosen = [actions[some] == action for action in range(n_actions)]
+    k, n = (
+        np.stack([np.rint(columns[own].T @ causes[own]) for own in chosen]).astype(np.int64) for columns in (of_cells, of_values)
+    )
+    n = n[:, begun] + k
+    enough, all_k, all_n = SURE + math.log(k.size), k.sum(axis=0), n.sum(axis=0)
+    hanging = np.max([(_evidence(k[a], n[a], all_k, all_n)).max(axis=1) for a in range(n_actions)], axis=0) > enough
+    for f, cell in kept[hanging].tolist():
+        result[factors[f]][cell] = True
+    return result
 
 
 def _classes(ways: Ints, times: Ints, hanging: Bools, *met: NDArray[Any]) -> dict[int, int]:
@@ -196,12 +229,17 @@ def _changes_of(before: NDArray[Any], after: NDArray[Any]) -> _Changes:
     return _Changes(value.astype(np.int64), cell, start, np.column_stack([known[start], pairs % width]).astype(np.int64))
 
 
-def _columns(numbers: list[Ints], most: int) -> tuple[NDArray[np.float32], Ints]:
-    """Indicators float32 [N, C] of the most frequent numbers but -1, and for each column its row in the list and its number."""
+def _columns(numbers: list[Ints], most: int, even: bool = False) -> tuple[NDArray[np.float32], Ints]:
+    """Indicators float32 [N, C] of the most frequent numbers but -1, and for each column its row in the list and its number.
+
+    With ``even``, those come first that cut the rows most evenly, and of a factor with two values one is enough.
+    """
     found: list[tuple[int, int, int]] = []
     for i, row in enumerate(numbers):
         times = np.bincount(row[row >= 0])
-        found += [(-int(times[number]), i, int(number)) for number in np.flatnonzero(times)]
+        weight = np.minimum(times, len(row) - times) if even else times
+        met = np.flatnonzero(times)
+        found += [(-int(weight[number]), i, int(number)) for number in (met[1:] if even and len(met) == 2 else met)]
     kept = np.array([entry[1:] for entry in sorted(found)[:most]], dtype=np.int64).reshape(-1, 2)
     columns = np.zeros((len(numbers[0]), len(kept) + 1), dtype=np.float32)  # the last for those that are left out
     for i in np.unique(kept[:, 0]):

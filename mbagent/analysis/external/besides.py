@@ -84,7 +84,7 @@ class BesideWorld:
         same = (core.going[numbers] == target[:, None]) & (core.over[numbers] == over[:, None])
         shares: NDArray[np.float64] = same.mean(axis=1)
         chances = core.slip * shares + (1.0 - core.slip) * same[np.arange(n), actions]
-        truth = np.log(chances) + np.where(flipped, np.log(FLICKER), np.log(1.0 - FLICKER)).sum(axis=1)
+        truth = np.log(chances) + np.log(np.where(flipped, FLICKER, 1.0 - FLICKER)).sum(axis=1)
         before, after = np.hstack([core.values[numbers], bits]), np.hstack([core.values[target], bits ^ flipped])
         said = model.log_prob(before, actions, after, over)
         return float(np.maximum(0.0, 1.0 - np.exp(said - truth)).mean())
