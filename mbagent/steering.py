@@ -139,8 +139,8 @@ def find_steered(before: Values, actions: Actions, after: Values, n_actions: int
         directly[factor] = _speaks(logs).max() > enough or contexts[factor].any()
         odds = _evidence(of_cell, of_cell + staying[change.start])  # one change must not look steered for another that is
         hanging = contexts[factor] | (odds.max(axis=1) > enough / (1 + directly[factor]))
-        unsure = staying.sum(axis=1)[change.start] < RARE
-        classes[factor] = _classes(change.ways, of_cell.sum(axis=1), hanging | unsure, before[:, factor], after[:, factor])
+        times = np.where(staying.sum(axis=1)[change.start] < RARE, 0, of_cell.sum(axis=1))  # without both, odds tell nothing
+        classes[factor] = _classes(change.ways, times, hanging, before[:, factor], after[:, factor])
     return Steered(directly, classes)
 
 
@@ -173,7 +173,7 @@ def _in_contexts(changes: Mapping[int, _Changes], before: Values, actions: Actio
 
 
 def _classes(ways: Ints, times: Ints, hanging: Bools, *met: NDArray[Any]) -> dict[int, int]:
-    """The lowest value of each value's class; what changed too seldom to be told from what hangs on actions stays apart."""
+    """The lowest value of each value's class; what changed too few ``times`` to tell whether it hangs on actions stays apart."""
     both: dict[tuple[int, int], int] = {}
     apart = {(min(pair), max(pair)) for pair in ways[hanging].tolist()}
     for pair, n in zip(ways.tolist(), times.tolist(), strict=True):
