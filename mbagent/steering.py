@@ -23,6 +23,9 @@ LOOKED_AT = 8192
 CELLS, CAUSES = 1024, 512
 """Changes, and values of other factors, that are set against each other at most: the most frequent ones."""
 
+MOST_COUNTS, MOST_VALUE = 4_000_000, 65_535
+"""Numbers that are counted at once, and the largest value of a factor; one with more is neither steered nor cut into classes."""
+
 SHARE = 0.1
 """Of the changes of a factor that hangs on something, those that are expected to hang on it."""
 
@@ -130,6 +133,9 @@ def find_steered(before: Values, actions: Actions, after: Values, n_actions: int
     contexts = _in_contexts(changes, before, actions, n_actions)
     for factor, change in changes.items():
         n_values, moved = int(change.value.max()) + 1, change.cell >= 0
+        if (n_values + len(change.start)) * n_actions > MOST_COUNTS or change.ways.max() > MOST_VALUE:
+            classes[factor] = {int(value): int(value) for value in np.unique(before[:, factor])}
+            continue
         pairs = change.value * n_actions + actions
         of_value = np.bincount(pairs, minlength=n_values * n_actions).reshape(n_values, -1)
         staying = np.bincount(pairs[~moved], minlength=n_values * n_actions).reshape(n_values, -1)
@@ -157,7 +163,8 @@ def _in_contexts(changes: Mapping[int, _Changes], before: Values, actions: Actio
     place = {(f, number): column for column, (f, number) in enumerate(kept_values.tolist())}
     begun = np.array([place.get((f, int(changes[factors[f]].start[cell])), -1) for f, cell in kept.tolist()], dtype=np.int64)
     of_cells, kept, begun = of_cells[:, begun >= 0], kept[begun >= 0], begun[begun >= 0]
-    causes, _ = _columns([np.unique(before[some, f], return_inverse=True)[1] for f in factors], CAUSES, even=True)
+    most = min(CAUSES, MOST_COUNTS // (n_actions * max(1, len(begun))))
+    causes, _ = _columns([np.unique(before[some, f], return_inverse=True)[1] for f in factors], most, even=True)
     if not len(begun) or not causes.shape[1]:
         return result
     chosen = [actions[some] == action for action in range(n_actions)]

@@ -63,3 +63,13 @@ def test_where_actions_do_nothing_nothing_is_steered() -> None:
     found = find_steered(bits[:-1], actions, bits[1:], 4)
     assert not found.directly.any()
     assert not find_reached(found, bits[:-1], actions, bits[1:]).any()
+
+
+def test_very_many_actions_or_values_are_no_harm() -> None:
+    before, actions, after = ring(3000)
+    found = find_steered(before, actions * 1000, after, 4096)
+    assert found.directly[ALONE]
+    large = np.column_stack([before, before[:, LAMP] * 10**9])
+    found = find_steered(large, actions, np.column_stack([after, after[:, LAMP] * 10**9]), 3)
+    assert not found.directly[4]
+    np.testing.assert_array_equal(View(found, np.zeros(5, dtype=np.bool_)).factors, [ALONE, 4])
