@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -190,8 +189,8 @@ def _classes(ways: Ints, times: Ints, hanging: Bools, *met: NDArray[Any]) -> dic
     for (low, high), n in sorted(both.items()):
         if n >= RARE and (low, high) not in apart:
             one, other = lowest[low], lowest[high]
-            merged = [value for value, name in lowest.items() if name in (one, other)]
-            if not any(pair in apart for pair in combinations(merged, 2)):
+            merged = {value for value, name in lowest.items() if name in (one, other)}
+            if not any(a in merged and b in merged for a, b in apart):
                 lowest.update(dict.fromkeys(merged, min(one, other)))
     return lowest
 
