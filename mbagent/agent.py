@@ -64,7 +64,7 @@ class ModelLearningAgent(PrunableAlgorithm):
         model: "auto" (at present "graphs": decision graphs found from data), "networks" (predictor and conditioner trained
             by gradient), "paper" (section 3's networks), "tabular", "direct" (see ``forecasts``), another registered name,
             or a TransitionModel.
-        exploration: "auto" ("directed" while the states met are few, else "random"), "persistent", or an Exploration.
+        exploration: "auto" ("directed" while the states that matter are few, else "random"), "persistent", or an Exploration.
         gamma: discount of a step when planning.
         num_simulations: simulations for each decision.
         time_budget: seconds for each decision instead (see PlannerSettings), or None.

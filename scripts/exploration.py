@@ -2,6 +2,7 @@
 
 python scripts/exploration.py                                       # quick: three worlds, one seed
 python scripts/exploration.py --worlds SysAdmin Navigation --seeds 3
+python scripts/exploration.py --worlds "maze 12x12, 10 lights" "grid 30x30"
 
 """
 
@@ -21,6 +22,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from mbagent.analysis.external.besides import BESIDES, BesideWorld
 from mbagent.analysis.external.coverage import Row, Study, draw_coverage, run_study
 from mbagent.analysis.external.worlds import exact_world, find_world
 from mbagent.analysis.folders import check_run, open_folder, replaced, write_csv
@@ -33,7 +35,7 @@ class Args:
     """Compare explorations."""
 
     worlds: tuple[str, ...] = ("FrozenLake 8x8", "CliffWalking", "Taxi")
-    """Which environments; their rules must be known."""
+    """Which environments: those of the benchmark whose rules are known, or made-up ones (analysis.external.besides)."""
     explorations: tuple[str, ...] = ("random", "auto")
     """Which explorations."""
     marks: tuple[int, ...] = (500, 1000, 2000, 5000, 10_000, 20_000)
@@ -57,8 +59,11 @@ def plan(args: Args) -> list[Study]:
         raise ValueError(f"There is no exploration {unknown[0]!r}; choose from {', '.join(map(repr, EXPLORATIONS))}.")
     if min(args.seeds, args.workers, *args.marks) < 1 or list(args.marks) != sorted(set(args.marks)):
         raise ValueError("--seeds and --workers must be at least 1, and --marks ascending numbers of steps.")
-    worlds = [find_world(name) for name in args.worlds]
+    made_up = {world.name: world for world in BESIDES}
+    worlds = [made_up[name] if name in made_up else find_world(name) for name in args.worlds]
     for world in worlds:
+        if isinstance(world, BesideWorld):
+            continue
         if world.missing:
             raise ValueError(f'{world.name} needs pip install "mbagent[{world.missing}]".')
         if exact_world(world) is None:

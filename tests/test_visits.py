@@ -110,6 +110,72 @@ def test_with_more_states_than_a_table_holds_the_default_draws_what_random_explo
     assert explorer.table is None  # for good, and its memory is free
 
 
+class Lights(gym.Env[Any, Any]):
+    """A chain of which luck never meets the end, with lights beside it that flicker whatever is done."""
+
+    def __init__(self, n: int) -> None:
+        self.n, self.right = n, np.random.default_rng(1).integers(2, size=n)
+        self.observation_space = gym.spaces.MultiDiscrete([n] + [2] * 10)
+        self.action_space = gym.spaces.Discrete(2)
+
+    def shown(self) -> Ints:
+        return np.concatenate([[self.at], self.np_random.integers(2, size=10)])
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.at = 0
+        return self.shown(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.at = self.at + 1 if action == self.right[self.at] else 0
+        over = self.at == self.n
+        self.at %= self.n
+        return self.shown(), 0.0, over, False, {}
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+def test_lights_that_flicker_do_not_hide_where_to_go(copies: int, tmp_path: Any) -> None:
+    n = 20
+    envs = DummyVecEnv([lambda: Lights(n)] * copies)
+    agent = ModelLearningAgent("MctsPolicy", envs, seed=0, model="tabular", reward=lambda *_: np.zeros(len(_[1])))
+    met = set()
+    for _ in range(2):  # called again it goes on
+        rows = agent.learn(1000, log_interval=None, reset_num_timesteps=False).transitions.rows()
+    met = {(int(at), int(action)) for at, action in zip(rows.states[:, 0], rows.actions, strict=True)}
+    assert len(met) == 2 * n
+    explorer = agent._explorer
+    assert isinstance(explorer, DirectedExploration)
+    assert explorer.directed
+    assert explorer.view is not None
+    np.testing.assert_array_equal(explorer.view.factors, [0])
+    assert explorer.table is not None
+    assert len(explorer.table) == n
+    again = DirectedExploration(2, few=True)  # from a file it knows the same at once
+    again.recall(rows)
+    assert again.table is not None
+    assert again.view is not None
+    for place in range(n):
+        some = np.array([[place]])
+        np.testing.assert_array_equal(again.table.counts(some), explorer.table.counts(some))
+
+
+def test_after_so_many_values_no_more_are_kept_and_what_was_found_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mbagent.exploration.MANY_VALUES", 20_000)
+    explorer, rng, right = EXPLORATIONS["auto"](2), np.random.default_rng(0), np.random.default_rng(1).integers(2, size=20)
+    assert isinstance(explorer, DirectedExploration)
+    state, tried = np.zeros((1, 11), dtype=np.int64), set()
+    for _ in range(2000):
+        action = explorer.act(state, rng)
+        at = int(state[0, 0])
+        tried.add((at, int(action[0])))
+        after = np.concatenate([[(at + 1) % 20 if action[0] == right[at] else 0], rng.integers(2, size=10)])[None]
+        explorer.observe(state, action, after, np.zeros(1, dtype=np.bool_))
+        state = after
+    assert explorer._kept is None
+    assert explorer.directed
+    assert len(tried) == 40
+
+
 def test_copies_in_the_same_state_share_the_untried_actions_out() -> None:
     table = VisitTable(4)
     nodes = table.add(np.zeros((4, 2), dtype=np.int64))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from mbagent.agent import ModelLearningAgent
+from mbagent.analysis.external.besides import BesideWorld
 from mbagent.analysis.external.exact import Exact
 from mbagent.analysis.external.worlds import World, exact_world, true_model
 from mbagent.analysis.pages import FIGURE_STYLE, to_png
@@ -40,7 +41,7 @@ class Study:
         marks: environment steps after which to measure, ascending; the model is fitted anew at each.
     """
 
-    world: World
+    world: World | BesideWorld
     exploration: str
     seed: int
     marks: tuple[int, ...]
@@ -83,42 +84,64 @@ def wrongness(model: TransitionModel, truth: Successors, states: States, actions
 
 
 def run_study(study: Study) -> list[Row]:
-    """Explores and fits from mark to mark; a row for each.
+    """Explores and fits from mark to mark; a row for each. There is no return where a world has no reward.
 
     Raises:
         ValueError: the world's rules are not known.
     """
-    exact = exact_world(study.world)
-    if exact is None:
-        raise ValueError(f"The true rules of {study.world.name} are not at hand.")
     agent = ModelLearningAgent("MctsPolicy", study.world.make(), seed=study.seed, exploration=study.exploration)
-    n_actions, states = agent.policy.actions.n, agent.policy.factored.encode(exact.observations)
-    pairs = np.stack([grid.ravel() for grid in np.meshgrid(reachable(exact), np.arange(n_actions), indexing="ij")], axis=1)
-    some = pairs[np.random.default_rng(0).permutation(len(pairs))[:MAX_PAIRS]]
-    truth = outcomes(study.world, exact, some[:, 0], some[:, 1])
+    figures = _beside(study.world, agent) if isinstance(study.world, BesideWorld) else _exactly(study.world, agent)
     rows: list[Row] = []
     for mark in study.marks:
         began = time.process_time()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that the reward is learned
+            warnings.simplefilter("ignore")  # that the reward is learned, or there is none
             agent.learn(mark - agent.num_timesteps, log_interval=None, reset_num_timesteps=False)
+        row = {"world": study.world.name, "exploration": study.exploration, "seed": study.seed, "steps": mark}
+        rows.append(row | figures() | {"learn_seconds": time.process_time() - began})
+    return rows
+
+
+def _exactly(world: World, agent: ModelLearningAgent) -> Callable[[], Row]:
+    """What measures an agent in a world that is known as tables."""
+    exact = exact_world(world)
+    if exact is None:
+        raise ValueError(f"The true rules of {world.name} are not at hand.")
+    n_actions, states = agent.policy.actions.n, agent.policy.factored.encode(exact.observations)
+    pairs = _pairs(reachable(exact), n_actions)
+    some = pairs[np.random.default_rng(0).permutation(len(pairs))[:MAX_PAIRS]]
+    truth = outcomes(world, exact, some[:, 0], some[:, 1])
+
+    def figures() -> Row:
         met = agent.transitions.rows()
         tried = np.unique(np.column_stack([met.before, met.actions]), axis=0)
         span = exact.best() - exact.random()
         actions = agent.predict(exact.observations, deterministic=True)[0]
-        rows.append(
-            {
-                "world": study.world.name,
-                "exploration": study.exploration,
-                "seed": study.seed,
-                "steps": mark,
-                "tried": len(tried) / len(pairs),
-                "error": wrongness(agent.model, truth, states[some[:, 0]], some[:, 1]),
-                "normalised": (exact.of(agent.policy.actions.encode(actions)) - exact.random()) / span,
-                "learn_seconds": time.process_time() - began,
-            }
-        )
-    return rows
+        return {
+            "tried": len(tried) / len(pairs),
+            "error": wrongness(agent.model, truth, states[some[:, 0]], some[:, 1]),
+            "normalised": (exact.of(agent.policy.actions.encode(actions)) - exact.random()) / span,
+        }
+
+    return figures
+
+
+def _beside(world: BesideWorld, agent: ModelLearningAgent) -> Callable[[], Row]:
+    """What measures an agent in a world that was made up."""
+    pairs = _pairs(world.known.reachable(), agent.policy.actions.n)
+    some = pairs[np.random.default_rng(0).permutation(len(pairs))[:MAX_PAIRS]]
+
+    def figures() -> Row:
+        met = agent.transitions.rows()
+        error = world.wrongness(agent.model, some[:, 0], some[:, 1])
+        return {"tried": world.tried(met.states, met.actions), "error": error, "normalised": float("nan")}
+
+    return figures
+
+
+def _pairs(numbers: NDArray[np.int64], n_actions: int) -> NDArray[np.int64]:
+    """Every (state, action), int64 [N, 2]."""
+    return np.stack([part.ravel() for part in np.meshgrid(numbers, np.arange(n_actions), indexing="ij")], axis=1)
 
 
 def draw_coverage(rows: Sequence[Row]) -> bytes:
