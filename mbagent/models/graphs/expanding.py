@@ -14,6 +14,7 @@ from mbagent.models.compiled_model import Outcomes, implements, outcomes, work_f
 from mbagent.models.graphs.acts import Acts
 from mbagent.models.graphs.compiled import Bools, Floats, Ints, meets
 from mbagent.models.graphs.draws import settled
+from mbagent.models.graphs.ending import end_rate
 from mbagent.models.graphs.laws import leave_out
 from mbagent.models.graphs.lean import (
     COUPLING,
@@ -50,6 +51,7 @@ class GraphWork(NamedTuple):
         opened: what is uncertain: a unit and -1, or where a coupling's units begin and how many they are, int64 [U + Q, 2].
         p: particles.
         base: the next state but for what is uncertain, int64 [F].
+        following: the next state that a particle stands for, int64 [F].
     """
 
     on: Bools
@@ -64,6 +66,7 @@ class GraphWork(NamedTuple):
     opened: Ints
     p: Particles
     base: Ints
+    following: Ints
 
 
 @implements(work_for, Lean)
@@ -85,6 +88,7 @@ def graph_work(g: Lean, n_grid: int) -> GraphWork:
         np.empty((width, 2), dtype=np.int64),
         new_particles(n_grid, width),
         np.empty(n_factors, dtype=np.int64),
+        np.empty(n_factors, dtype=np.int64),
     )
 
 
@@ -104,7 +108,7 @@ def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.u
     listed, values, coupled = work.units, work.values, work.coupled
     per_coupling, opened, base = work.per_coupling, work.opened, work.base
     p, acts = work.p, g.acts
-    counts, met, weights = g.counts, g.met, g.weights
+    counts, met, weights, late_end = g.counts, g.met, g.weights, len(g.end_first) > 0
     n_actions, first_meeting = len(always), len(columns) + acts.n_columns
     n_different = show_state(state, shown, columns, different, on)
     for m in range(len(meetings)):
@@ -116,12 +120,14 @@ def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.u
         _show_action(acts, action, len(columns), True, on)
         way = acts.way[action]
         rates_of(listed[:n], state, way, on, units, members, entries, entry, node, leaf, habit, base_rates, still, values, rates)
-        _show_action(acts, action, len(columns), False, on)
         for f in range(len(state)):
             base[f] = state[f]
         n_live, n_open, ended = _settle(
-            listed[:n], units, members, exactly, values, rates, joint, coupled, per_coupling, opened, p, base, grid
+            listed[:n], units, members, exactly, values, rates, joint, coupled, per_coupling, opened, p, base, late_end, grid
         )
+        if late_end:
+            n_live, n_open = _end(g, work, way, n_live, n_open, grid), n_open + 1
+        _show_action(acts, action, len(columns), False, on)
         _write(total, n_live, n_open, ended, base, opened, coupled, units, members, p, n_grid, out)
         if len(counts) or len(met):
             n_live = leave_out(counts, met, weights, cells, state, out.states, out.terminated, out.probabilities, total, n_live)
@@ -131,6 +137,31 @@ def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.u
         for column in range(shown[different[i]], shown[different[i] + 1]):
             on[column] = usual[column]
     return total
+
+
+@compiled
+def _end(g: Lean, work: GraphWork, way: int, n_live: int, n_open: int, grid: Grid) -> int:
+    """Draws whether the episode ends, for each particle given what it became so far; returns how many particles there are."""
+    p, joint, following, opened, end = work.p, work.joint, work.following, work.opened, len(g.units) - 2
+    for q in range(n_live):
+        _fill(following, work.base, opened, n_open, work.coupled, g.units, g.members, p.factors[q])
+        joint[1] = end_rate(
+            g.end_first[way],
+            g.end_node,
+            g.end_rate,
+            g.still[0],
+            following,
+            work.on,
+            g.factor,
+            g.columns,
+            g.cells,
+            g.next_meetings,
+        )
+        joint[0] = 1.0 - joint[1]
+        prune(joint, 2)
+        n_live = split(p, q, n_live, end, n_open, joint, 2, grid[0], grid[1], grid[2])
+    opened[n_open, 0], opened[n_open, 1] = end, -1
+    return n_live
 
 
 @inlined
@@ -154,6 +185,7 @@ def _settle(
     opened: Ints,
     p: Particles,
     base: Ints,
+    ends_late: bool,
     grid: Grid,
 ) -> tuple[int, int, bool]:
     """Writes what is sure to ``base`` and shares the particles over the rest; returns (particles, open ones, whether it ends)."""
@@ -162,6 +194,8 @@ def _settle(
         unit = touched[i]
         if units[unit, COUPLING] >= 0:
             per_coupling[units[unit, COUPLING]] += 1
+            continue
+        if ends_late and unit == n_units - 2:
             continue
         n, start = units[unit, OUTPUTS], units[unit, START]
         best = settled(rates, start, n)
@@ -232,26 +266,33 @@ def _write(
     out: Outcomes,
 ) -> None:
     """Writes the outcomes that the particles stand for from number ``total`` on, weighted as ``particles.assemble`` does."""
-    states, terminated, probabilities, factors, mass, n_units = (
-        out.states, out.terminated, out.probabilities, p.factors, p.mass, len(units),
-    )  # fmt: skip
+    states, terminated, probabilities, factors, mass = out.states, out.terminated, out.probabilities, p.factors, p.mass
     everything = 0.0
     for q in range(n_live):
         everything += mass[q]
     for q in range(n_live):
-        state, over = states[total + q], ended
-        for f in range(len(base)):
-            state[f] = base[f]
-        for v in range(n_open):
-            number, n = opened[v, 0], opened[v, 1]
-            if n >= 0:
-                _choose(state, coupled, number, n, factors[q, v], units, members)
-            elif number == n_units - 2:
-                over = factors[q, v] == 1
-            else:
-                _put(state, number, factors[q, v], units, members)
-        terminated[total + q] = over
+        terminated[total + q] = ended
+        last = _fill(states[total + q], base, opened, n_open, coupled, units, members, factors[q])
+        if last >= 0:
+            terminated[total + q] = factors[q, last] == 1
         probabilities[total + q] = mass[q] / everything if everything >= FOUND else p.points[q] / n_grid
+
+
+@inlined
+def _fill(state: Ints, base: Ints, opened: Ints, n_open: int, coupled: Ints, units: Ints, members: Ints, chosen: Ints) -> int:
+    """Writes the next state [F] that a particle stands for; returns which of the open ones is the end, or -1."""
+    end, n_units = -1, len(units)
+    for f in range(len(base)):
+        state[f] = base[f]
+    for v in range(n_open):
+        number, n = opened[v, 0], opened[v, 1]
+        if n >= 0:
+            _choose(state, coupled, number, n, chosen[v], units, members)
+        elif number == n_units - 2:
+            end = v
+        else:
+            _put(state, number, chosen[v], units, members)
+    return int(end)
 
 
 @inlined

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from mbagent.models.graphs.acts import Acts
 from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, distributions, n_columns, show
 from mbagent.models.graphs.draws import settled
+from mbagent.models.graphs.ending import end_graph
 from mbagent.models.graphs.units import Layout
 from mbagent_envs._compiled import compiled, inlined
 
@@ -54,7 +55,8 @@ class Lean(NamedTuple):
         by_meeting: the same of meetings, uint64 [A or 1, M, W].
         always: units that do something even where everything is 0, uint64 [A, W].
         usual_on: columns that are on where everything is 0 and no action is taken, bool [D].
-        acts: see ``units.Layout``.
+        acts, factor, next_meetings: see ``units.Layout``.
+        end_first, end_node, end_rate: graph of the end where it is drawn late, else empty, see ``ending.end_graph``.
     """
 
     units: Ints
@@ -80,31 +82,28 @@ class Lean(NamedTuple):
     always: Words
     usual_on: Bools
     acts: Acts
+    factor: Ints
+    next_meetings: Ints
+    end_first: Ints
+    end_node: NDArray[np.int32]
+    end_rate: Floats
 
 
-def lean(layout: Layout, graphs: Graphs, cardinalities: tuple[int, ...]) -> Lean:
+def lean(layout: Layout, graphs: Graphs, late: Graphs, cardinalities: tuple[int, ...]) -> Lean:
     """The arrays of some graphs.
 
     Args:
         layout: the units.
         graphs: of all of them.
+        late: of none, or of the end alone.
         cardinalities: number of values of each factor, length F.
     """
-    n_words, n_rows = -(-len(layout.outputs) // 64), int(sum(cardinalities))
-    n_actions = len(layout.acts.way)
-    n_tables = n_actions if n_actions * n_rows * n_words <= MOST_WORDS else 1
     row = np.concatenate([[0], np.cumsum(cardinalities)]).astype(np.int64)
-    touched = np.zeros((n_tables, n_rows, n_words), dtype=np.uint64)
-    by_meeting = np.zeros((n_tables, len(layout.meetings), n_words), dtype=np.uint64)
-    nothing, on = np.zeros(layout.n_factors, dtype=np.int64), np.zeros(n_columns(layout), dtype=np.bool_)
     shown = np.searchsorted(layout.factor, np.arange(layout.n_factors + 1)).astype(np.int64)
-    always = np.zeros((n_actions, n_words), dtype=np.uint64)
-    _usual(layout, graphs, nothing, on, always)
-    _dependents(layout, graphs, row, nothing, on, touched, by_meeting)
-    show(nothing, 0, layout, on)
-    on[len(layout.factor) : len(layout.factor) + layout.acts.n_columns] = False
+    always, touched, by_meeting, on = _tables(layout, graphs, row)
     sizes = np.diff(layout.first)
     units = np.stack([layout.first[:-1], sizes, layout.outputs, graphs.start[:-1], graphs.pairs[:-1], layout.coupling_of], axis=1)
+    end_first, end_node, end_rate = end_graph(layout, late)
     return Lean(
         units=np.ascontiguousarray(units, dtype=np.int64),
         members=layout.members,
@@ -129,7 +128,27 @@ def lean(layout: Layout, graphs: Graphs, cardinalities: tuple[int, ...]) -> Lean
         always=always,
         usual_on=on,
         acts=layout.acts,
+        factor=layout.factor,
+        next_meetings=layout.next_meetings,
+        end_first=end_first,
+        end_node=end_node,
+        end_rate=end_rate,
     )
+
+
+def _tables(layout: Layout, graphs: Graphs, row: Ints) -> tuple[Words, Words, Words, Bools]:
+    """``always``, ``touched``, ``by_meeting`` and ``usual_on`` of Lean."""
+    n_words, n_rows, n_actions = -(-len(layout.outputs) // 64), int(row[-1]), len(layout.acts.way)
+    n_tables = n_actions if n_actions * n_rows * n_words <= MOST_WORDS else 1
+    touched = np.zeros((n_tables, n_rows, n_words), dtype=np.uint64)
+    by_meeting = np.zeros((n_tables, len(layout.meetings), n_words), dtype=np.uint64)
+    nothing, on = np.zeros(layout.n_factors, dtype=np.int64), np.zeros(n_columns(layout), dtype=np.bool_)
+    always = np.zeros((n_actions, n_words), dtype=np.uint64)
+    _usual(layout, graphs, nothing, on, always)
+    _dependents(layout, graphs, row, nothing, on, touched, by_meeting)
+    show(nothing, 0, layout, on)
+    on[len(layout.factor) : len(layout.factor) + layout.acts.n_columns] = False
+    return always, touched, by_meeting, on
 
 
 @compiled

@@ -9,6 +9,7 @@ import numpy as np
 from mbagent.models.compiled_model import Outcomes, implements, outcomes, work_for
 from mbagent.models.graphs import expanding as expanding  # its overloads
 from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, distributions, n_columns, show
+from mbagent.models.graphs.ending import ends_late_only
 from mbagent.models.graphs.fitting import Fitted, nothing_late
 from mbagent.models.graphs.laws import leave_out
 from mbagent.models.graphs.lean import Lean, lean
@@ -37,8 +38,8 @@ class WholeKernel(NamedTuple):
 
 def kernel_of(fitted: Fitted, cardinalities: tuple[int, ...]) -> Lean | WholeKernel:
     """The kernel of fitted graphs: the lean one where it says everything."""
-    if not fitted.has_event and len(fitted.late.changing) == 0:
-        return lean(fitted.layout, fitted.usual, cardinalities)
+    if not fitted.has_event and ends_late_only(fitted.layout, fitted.late):
+        return lean(fitted.layout, fitted.usual, fitted.late, cardinalities)
     none = nothing_late(fitted.event)
     return WholeKernel(fitted.layout, fitted.usual, fitted.late, fitted.event, none, bool(fitted.has_event))
 

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from mbagent.models.factory import build_model
 from mbagent.models.graphs import DecisionGraphModel
@@ -14,6 +15,7 @@ from mbagent.planning.lookahead import grow_lookahead
 from mbagent.spaces import FactoredSpace
 from mbagent_envs import FlierCatcher, GeyserRunner, Maneuverer
 from mbagent_envs.game import Game
+from tests.models.graphs.test_laws import fitted
 from tests.models.graphs.test_model import CARDINALITIES, small_world
 from tests.models.helpers import dataset, played
 
@@ -40,12 +42,45 @@ def of_small_world() -> tuple[DecisionGraphModel, np.ndarray]:
     return model, states
 
 
+def of_walker() -> tuple[DecisionGraphModel, np.ndarray]:
+    """A walker that goes up or down, or right under action 1, by chance; on the target it is over, but for one time in four."""
+    rng, rows, place = np.random.default_rng(0), [], (0, 0)
+    target = np.zeros((4, 4), dtype=np.int64)
+    target[2, 3] = 1
+    for _ in range(4000):
+        before, action = np.zeros((4, 4), dtype=np.int64), int(rng.integers(2))
+        before[place] = 1
+        move = (int(rng.integers(-1, 2)), action * int(rng.integers(2)))
+        place = (place[0] + move[0]) % 4, (place[1] + move[1]) % 4
+        after = np.zeros((4, 4), dtype=np.int64)
+        after[place] = 1
+        over = bool((after & target).any() and rng.random() < 0.75)
+        rows.append((np.stack([before, target]).ravel(), action, np.stack([after, target]).ravel(), over))
+        place = (0, 0) if over else place
+    states, actions, following, terminated = (np.array(part) for part in zip(*rows, strict=True))
+    space = FactoredSpace(spaces.MultiBinary((2, 4, 4)))
+    model = build_model("graphs", space, 2, 0.02)
+    assert isinstance(model, DecisionGraphModel)
+    model.fit(dataset(space.cardinalities, 2, states, actions, following, terminated))
+    return model, states
+
+
+def test_an_end_that_hangs_on_what_comes_is_still_lean() -> None:
+    model, _ = of_walker()
+    kernel = model.kernel()
+    assert isinstance(kernel, Lean)
+    assert len(kernel.end_first) == 2
+    assert len(model.fitted.late.changing) == 1
+
+
 WORLDS: dict[str, Callable[[], tuple[DecisionGraphModel, np.ndarray]]] = {
     "planes with redraws": lambda: of_game(Maneuverer(size=4)),
     "planes with luck": lambda: of_game(FlierCatcher(height=4, width=5)),
     "groups": lambda: of_game(GeyserRunner()),
     "rare events": lambda: of_games_bits(Maneuverer(size=4)),
     "wheels and ends": of_small_world,
+    "ends by chance where something comes": of_walker,
+    "planes with laws": fitted,
 }
 
 
