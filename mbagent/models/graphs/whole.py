@@ -113,21 +113,17 @@ def whole_outcomes(
             rare = successors(states[:1], actions[a : a + 1], layout, kernel.event, kernel.event_late, n_grid, key, offset)
             n += _take(rare[1], rare[2], rare[3], rare[4], rate, n_grid, total + n, out)
         if len(layout.counts) or len(layout.met):
-            n = leave_out(
-                layout.counts,
-                layout.met,
-                layout.weights,
-                layout.cells,
-                state,
-                out.states,
-                out.terminated,
-                out.probabilities,
-                total,
-                n,
-            )
+            n = _leave_out(layout, state, total, n, out)
         out.counts[action] = n
         total += n
     return total
+
+
+@compiled
+def _leave_out(layout: Layout, state: Ints, first: int, n: int, out: Outcomes) -> int:
+    """Takes what breaks a law out of the last ``n`` outcomes; returns how many are left."""
+    counts, met, weights, cells = layout.counts, layout.met, layout.weights, layout.cells
+    return leave_out(counts, met, weights, cells, state, out.states, out.terminated, out.probabilities, first, n)
 
 
 @compiled
