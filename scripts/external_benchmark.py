@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mbagent.analysis.external.experiment import AGENTS, TRUE, Row, Task, run_task
-from mbagent.analysis.external.worlds import CONTINUOUS, WORLDS, find_world
+from mbagent.analysis.external.worlds import ARCADE, CONTINUOUS, WORLDS, find_world
 from mbagent.analysis.folders import check_run, open_folder, write_csv
 from mbagent.analysis.parallel import run_all
 from mbagent.analysis.statistics import interquartile_interval
@@ -83,7 +83,7 @@ def plan(args: Args) -> list[Task]:
     for world in map(find_world, args.worlds):
         steps = args.steps or world.steps
         for agent in args.agents:
-            if world.missing is None and not (agent == TRUE and world.kind == "binned"):
+            if world.missing is None and not (agent == TRUE and world.kind in ("binned", "minatar")):
                 more = [
                     Task(world, agent, args.first_seed + i, steps, episodes, args.baseline_steps or steps, args.reward_scale)
                     for i in range(seeds)
@@ -112,7 +112,7 @@ def show(rows: Sequence[Row], console: Console) -> None:
     for row in rows:
         groups.setdefault((row["world"], row["agent"]), []).append(row)
     order = {name: i for i, name in enumerate(AGENTS)}
-    places = {world.name: i for i, world in enumerate((*WORLDS, *CONTINUOUS))}
+    places = {world.name: i for i, world in enumerate((*WORLDS, *CONTINUOUS, *ARCADE))}
     for (world, agent), group in sorted(groups.items(), key=lambda item: (places[item[0][0]], order[item[0][1]])):
         mean = {name: float(np.mean([row[name] for row in group])) for name in group[0] if name not in ("world", "agent")}
         known = np.isfinite(mean["normalised"])

@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import DiscretizeObservation, TransformObservation
 
+from mbagent.adapters.minatar import make_minatar
 from mbagent.adapters.minigrid import make_minigrid
 from mbagent.adapters.rddl import RddlEnv
 from mbagent.analysis.cases import Scale
@@ -44,7 +45,7 @@ class World:
     """
 
     name: str
-    kind: Literal["toy_text", "rddl", "minigrid", "binned"]
+    kind: Literal["toy_text", "rddl", "minigrid", "binned", "minatar"]
     target: str
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     steps: int = 20_000
@@ -55,7 +56,7 @@ class World:
     @property
     def missing(self) -> str | None:
         """The extra that must be installed first, or None."""
-        needed = {"rddl": ("pyRDDLGym", "rddlrepository"), "minigrid": ("minigrid",)}.get(self.kind, ())
+        needed = {"rddl": ("pyRDDLGym", "rddlrepository"), "minigrid": ("minigrid",), "minatar": ("minatar",)}.get(self.kind, ())
         return self.kind if any(importlib.util.find_spec(name) is None for name in needed) else None
 
     def make(self) -> gym.Env[Any, Any]:
@@ -66,6 +67,8 @@ class World:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DeprecationWarning)
                 return make_minigrid(self.target, **self.kwargs)
+        if self.kind == "minatar":
+            return make_minatar(self.target, **self.kwargs)
         env = gym.make(self.target, **self.kwargs)
         env = clipped(env, self.bounds) if self.bounds else env
         return DiscretizeObservation(env, self.bins, multidiscrete=True) if self.bins else env
@@ -98,13 +101,20 @@ CONTINUOUS = (
 """The examples of docs/environments.md."""
 
 
+ARCADE = (
+    World("MinAtar Breakout", "minatar", "breakout", steps=100_000),
+    World("MinAtar Asterix", "minatar", "asterix", steps=100_000),
+)
+"""Games of scripts/learning_curves.py, with sticky actions and ever more difficult; a history of one step."""
+
+
 def find_world(name: str) -> World:
     """The world called ``name``.
 
     Raises:
         ValueError: there is none; the message lists those there are.
     """
-    known = (*WORLDS, *CONTINUOUS)
+    known = (*WORLDS, *CONTINUOUS, *ARCADE)
     for world in known:
         if world.name == name:
             return world
