@@ -14,7 +14,7 @@ from mbagent.steering import View, find_reached, find_steered
 from mbagent.transitions import TransitionBatch, TransitionDataset
 from mbagent.visits import START, VisitTable
 
-FEW_STATES, STEPS_PER_STATE = 64, 4
+FEW_STATES, STEPS_PER_STATE = 64, 8
 """States are few enough for a table where there are so many at most, and one more for each so many steps."""
 
 MANY_STATES = 50_000
