@@ -118,35 +118,58 @@ class LearnedReward:
         self._values = values if self._classes else np.array([values.mean(), max(values.std(), 1e-6)])
         self._graphs = None
         self._build()
-        held_out, (distinct, weights) = float("nan"), _distinct(rows)
+        held_out, clearly, (distinct, weights) = float("nan"), False, _distinct(rows)
         if len(values) > 1:
             episodes = np.unique(rows.episodes)
             chosen = np.random.default_rng(self._seed).permutation(episodes)[: int(HELD_OUT * len(episodes))]
             held = np.isin(rows.episodes, chosen)
             if held.any():
-                held_out = self._choose(rows.select(np.flatnonzero(~held)), rows.select(np.flatnonzero(held)))
+                held_out, clearly = self._choose(rows.select(np.flatnonzero(~held)), rows.select(np.flatnonzero(held)))
             if self._graphs is not None or not held.any():
                 self._graphs = self._as_graphs(rows)
-            if self._graphs is None or (not held.any() and self._share_right(distinct, weights) < 1.0):
-                self._graphs = None
-                self._train(distinct, torch.from_numpy(weights), STEPS // 2 if held.any() else STEPS)
+            trained = held.any() and self._graphs is None
+            if self._graphs is not None and not clearly:
+                misses = self._missed(rows) > 0 or (not held.any() and self._share_right(distinct, weights) < 1.0)
+                self._graphs = None if misses else self._graphs
+            if self._graphs is None:
+                self._train(distinct, torch.from_numpy(weights), STEPS // 2 if trained else STEPS)
         right = self._share_right(distinct, weights)
         return RewardReport(len(values), right, held_out, _contrary(rows))
 
-    def _choose(self, train: TransitionBatch, tests: TransitionBatch) -> float:
-        """Learns from some rows in the way that does better on others; returns the share of those that it gets right."""
-        self._graphs, error, right = self._as_graphs(train), np.inf, 0.0
-        if self._graphs is not None:
-            error, right = self._error(tests), self._share_right(tests)
-        if right < 1.0:
-            graphs, self._graphs = self._graphs, None
-            distinct, weights = _distinct(train)
-            self._train(distinct, torch.from_numpy(weights), STEPS)
-            if error <= self._error(tests):
-                self._graphs = graphs
-            else:
-                right = self._share_right(tests)
-        return right
+    def _choose(self, train: TransitionBatch, tests: TransitionBatch) -> tuple[float, bool]:
+        """Learns from some rows in the way that does better on others.
+
+        Graphs ask for evidence, so that they do not see a reward that was met once or twice; where held-out rows do not tell the
+        ways apart, that decides.
+
+        Returns:
+            (share of those that it gets right, whether graphs are clearly better).
+        """
+        graphs = self._graphs = self._as_graphs(train)
+        if graphs is None:
+            self._train_on(train)
+            return self._share_right(tests), False
+        missed, errors, right = self._missed(train), self._errors(tests), self._share_right(tests)
+        if right == 1.0 and missed == 0:
+            return right, False
+        self._graphs = None
+        self._train_on(train)
+        gain = self._errors(tests) - errors
+        spread = 2.0 * float(gain.std()) / len(gain) ** 0.5
+        if gain.mean() > spread or (gain.mean() >= 0.0 and missed <= self._missed(train)):
+            self._graphs = graphs
+            return right, bool(gain.mean() > spread)
+        return self._share_right(tests), False
+
+    def _train_on(self, rows: TransitionBatch) -> None:
+        distinct, weights = _distinct(rows)
+        self._train(distinct, torch.from_numpy(weights), STEPS)
+
+    def _missed(self, rows: TransitionBatch) -> int:
+        """Number of rows that earn something else than most do, and are told as if they did not."""
+        off = self._order[0]
+        told = np.abs(self(rows.states, rows.actions, rows.next_states) - off)
+        return int((told < 0.5 * np.abs(rows.rewards - off)).sum())
 
     def _as_graphs(self, rows: TransitionBatch) -> ClassGraphs | None:
         """Decision graphs for the rewards of some rows; None where there are too many different ones."""
@@ -158,9 +181,10 @@ class LearnedReward:
         self._order = self._values[order]
         return learn_classes(rows, np.argsort(order)[number], self._codec.cardinalities, self._parts, self._planes)
 
-    def _error(self, rows: TransitionBatch) -> float:
-        """Mean squared error."""
-        return float(np.mean((self(rows.states, rows.actions, rows.next_states) - rows.rewards) ** 2))
+    def _errors(self, rows: TransitionBatch) -> Floats:
+        """Squared errors [N]."""
+        errors: Floats = (self(rows.states, rows.actions, rows.next_states) - rows.rewards) ** 2
+        return errors
 
     def _share_right(self, rows: TransitionBatch, weights: NDArray[np.float32] | None = None) -> float:
         reach = float(np.ptp(self._values)) if self._classes else 6.0 * float(self._values[1])

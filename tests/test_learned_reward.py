@@ -119,6 +119,17 @@ def test_on_planes_what_meets_what_is_found_wherever_it_is() -> None:
             other.load_state_dict({**weights, name: array})
 
 
+def test_a_reward_that_was_met_once_is_kept_in_mind() -> None:
+    data = rows(600)
+    once = np.arange(600) == 300
+    model = LearnedReward((2,) * 4, 3)
+    # the fourth bit is on in that row alone
+    states, after = data.states.copy(), data.next_states.copy()
+    states[:, 3], after[:, 3] = 0, once
+    model.fit(replace(data, before=states, after=after, rewards=once * 1.0))
+    np.testing.assert_array_equal(model(states, data.actions, after), once)
+
+
 def test_sums_of_many_things_are_left_to_a_network() -> None:
     rng, n = np.random.default_rng(0), 2000
     states, after = rng.integers(2, size=(2, n, 12))
