@@ -213,7 +213,7 @@ def _lead_to_news(graph: GraphArrays, q: Floats, tie: float, gamma: float, max_s
             break
 
 
-DRAWS, MOST_SAMPLES = 1_000_000, 256
+DRAWS, MOST_SAMPLES = 4_000_000, 256
 """Draws of a machine in which there is luck, and of each (state, action) pair, at most: a small machine affords more."""
 
 
