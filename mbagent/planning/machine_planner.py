@@ -15,7 +15,7 @@ from mbagent.planning.goal import Goal
 from mbagent.planning.leaf_values import LOWEST_KNOWN
 from mbagent.planning.lookahead import grow_lookahead
 from mbagent.planning.planner import Plan, PlannerSettings, best_actions
-from mbagent.planning.rehearsal import Way, plays_better
+from mbagent.planning.rehearsal import Way, best_way
 from mbagent.planning.value_iteration import Machine, Values, break_ties, solve
 
 REHEARSED: dict[str, Any] = {"time_budget": None, "reuse_tree": False}
@@ -130,7 +130,7 @@ class MachinePlanner:
         return graph, solve(graph, self._known_goal(), settings.gamma, len(roots), way.leaf), nodes
 
     def _chosen_way(self) -> Way:
-        """How to look ahead under this goal: as the settings say, or with learned values where that plays better."""
+        """How to look ahead under this goal: as the settings say, with learned values at the edge or instead, if any."""
         if self._way is None:
             settings, start = self.settings, self._start
             usual = Way(LOWEST_KNOWN, settings.lookahead_states, settings.lookahead_samples)
@@ -142,7 +142,7 @@ class MachinePlanner:
         return self._way
 
     def _rehearse(self, usual: Way, task: Task) -> Way:
-        """Learns values for the goal, and finds out whether plans are better with them."""
+        """Learns values for the goal, and finds out whether plans are best with them at the edge, without or only with them."""
         settings = self.settings
         self._way = None  # should the goal fail now, it is tried again
         leaf, met = learn_values(task)
@@ -155,8 +155,8 @@ class MachinePlanner:
 
         self.settings = replace(settings, **REHEARSED)
         try:
-            other = Way(leaf, 1, settings.n_samples)
-            return other if plays_better(replace(task, start=met), other, usual, act) else usual
+            ways = (usual._replace(leaf=leaf), usual, Way(leaf, 1, settings.n_samples))
+            return best_way(replace(task, start=met), ways, act)
         finally:
             self.settings, self._way = settings, None
 

@@ -28,9 +28,9 @@ class PlannerSettings:
         lookahead_states: states imagined around each root where the whole machine is larger than that.
         n_samples: draws for a (state, action) whose successors are too many to enumerate, in the whole machine.
         lookahead_samples: the same near a root, where the whole machine is too large.
-        learn_values: whether, where the whole machine is too large, values are learned in imagination, once for each goal. Where
-            that plays better in imagination, searches begin with ``n_samples`` draws of a first step and these values, instead of
-            with a lookahead machine.
+        learn_values: whether, where the whole machine is too large, values are learned in imagination, once for each goal. They
+            stand for what lies beyond the lookahead machine; where it plays better in imagination, searches do without them, or
+            begin with ``n_samples`` draws of a first step and these values, without a lookahead machine.
         leaf_values: "machine" (values of the reachable machine) or "rollouts" (random play).
         backup: "max" (an action is worth what the best behaviour after it is worth) or "mean" (plain UCT).
         choice: "mean", or "greatest" as in the paper (flat Monte Carlo only; it seeks risk).

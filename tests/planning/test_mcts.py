@@ -24,7 +24,7 @@ def test_search_finds_the_best_action_of_a_stochastic_world(seed: int, settings:
 def test_search_repairs_a_lookahead_too_short_to_see_the_prize(seed: int) -> None:
     # A corridor: the prize lies 9 steps to the right, the lookahead machine holds 4 states; the search must grow it.
     table, rewards = prize_corridor()
-    short = PlannerSettings(max_states=1, lookahead_states=4, num_simulations=600, wave=4, seed=seed)
+    short = PlannerSettings(max_states=1, lookahead_states=4, num_simulations=600, wave=4, learn_values=False, seed=seed)
     greedy = planner_for(MachinePlanner(short), table, rewards).plan(np.array([[0]]))
     assert greedy.values[0, 0] == greedy.values[0, 1]
     plan = planner_for(MctsPlanner(short), table, rewards).plan(np.array([[0]]))

@@ -1,3 +1,5 @@
+from collections import Counter
+
 import numpy as np
 import pytest
 
@@ -7,32 +9,47 @@ from mbagent.planning.leaf_values import LOWEST_KNOWN
 from mbagent.planning.machine_planner import MachinePlanner
 from mbagent.planning.mcts import MctsPlanner
 from mbagent.planning.planner import PlannerSettings
-from mbagent.planning.rehearsal import Way, _Trial, plays_better
+from mbagent.planning.rehearsal import BLOCKS, STEPS, Way, _Trial, best_way
 from tests.planning.test_fitted_values import Bulbs, count_bits
 
-USUAL, OTHER = (Way(LOWEST_KNOWN, n, 1) for n in (1, 2))
+WAYS = tuple(Way(LOWEST_KNOWN, n, 1) for n in range(1, 5))
 N_BULBS = 14
 START = np.zeros((1, N_BULBS), dtype=np.int64)
 
 
-def better(usual: int, other: int) -> bool:
-    """Whether taking always one action plays better than taking always another."""
+def best(*actions: int) -> int:
+    """Which of several ways plays best, each taking always one action."""
     task = Task(Bulbs(3, lasts=0.5), count_bits, np.zeros((1, 3), dtype=np.int64), gamma=0.99, seed=0)
+    ways = WAYS[: len(actions)]
 
     def act(way: Way, states: States) -> Actions:
-        return np.full(len(states), usual if way == USUAL else other)
+        return np.full(len(states), actions[ways.index(way)])
 
-    return plays_better(task, OTHER, USUAL, act)
+    return ways.index(best_way(task, ways, act))
 
 
 def test_a_better_way_is_found() -> None:
-    assert better(0, 1)
+    assert best(0, 1) == 1
+    assert best(0, 0, 1) == 2
 
 
-def test_in_doubt_the_usual_way_is_taken() -> None:
-    assert not better(1, 0)
-    assert not better(1, 1)
-    assert not better(1, 2)  # as good, and not alike
+def test_in_doubt_the_earlier_way_is_taken() -> None:
+    assert best(1, 0) == 0
+    assert best(1, 1) == 0
+    assert best(1, 2) == 0  # as good, and not alike
+    assert best(0, 1, 2, 0) == 1
+
+
+def test_no_way_is_played_twice_over() -> None:
+    """Three ways as good as each other: 12 episodes of each, from the same states."""
+    calls: list[tuple[int, int]] = []
+
+    def act(way: Way, states: States) -> Actions:
+        calls.append((way.states, len(states)))
+        return np.full(len(states), way.states % 3)
+
+    best_way(Task(Bulbs(3, lasts=0.5), count_bits, np.zeros((1, 3), dtype=np.int64), 0.99, 0), WAYS[:3], act)
+    assert max(Counter(calls).values()) <= BLOCKS * STEPS
 
 
 def test_episodes_that_end_earn_nothing_more() -> None:
@@ -43,8 +60,8 @@ def test_episodes_that_end_earn_nothing_more() -> None:
 
     task = Task(Ending(1), count_bits, np.zeros((1, 1), dtype=np.int64), gamma=0.5, seed=0)
     lit, dark = (
-        _Trial(task, USUAL, lambda way, s: np.ones(len(s), int)),
-        _Trial(task, USUAL, lambda way, s: np.zeros(len(s), int)),
+        _Trial(task, WAYS[0], lambda way, s: np.ones(len(s), int)),
+        _Trial(task, WAYS[0], lambda way, s: np.zeros(len(s), int)),
     )
     assert set(lit.returns(3)) == {1.0}
     assert set(dark.returns(3)) == {0.0}
