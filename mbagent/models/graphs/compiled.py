@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.graphs.leaves import LeafPrior, best_prior
+from mbagent.models.graphs.leaves import LeafPrior, fitted_prior
 from mbagent.models.graphs.search import Search
 from mbagent.models.graphs.units import BEYOND, Layout, Question
 from mbagent_envs._compiled import compiled
@@ -113,7 +113,7 @@ def build(layout: Layout, asked: Sequence[Question], found: Sequence[Search], ha
         habits: of each unit.
         still: probability that a unit without graphs changes.
     """
-    nodes, prior = Nodes(), best_prior(found)
+    nodes, prior = Nodes(), fitted_prior(found)
     pairs = np.concatenate([[0], np.cumsum(layout.acts.n_ways * layout.outputs)]).astype(np.int64)
     entries = [np.zeros((0, 3), dtype=np.int64)]
     for question, search in zip(asked, found, strict=True):
