@@ -5,6 +5,7 @@ Importing this package registers the games ``mbagent/GeyserRunner-v0``, ``mbagen
 """
 
 import mbagent_envs
+from mbagent import wrappers
 from mbagent.agent import ModelLearningAgent
 from mbagent.explanations import Explanation, Future, Step
 from mbagent.learned_env import LearnedEnv
@@ -33,4 +34,5 @@ __all__ = [
     "TransitionDataset",
     "ValueIterationPolicy",
     "mbagent_envs",
+    "wrappers",
 ]

@@ -8,7 +8,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from mbagent import ModelLearningAgent
+from mbagent import ModelLearningAgent, wrappers
 from mbagent.models import FitReport
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.wrappers import History
@@ -101,3 +101,8 @@ def test_a_model_that_sees_one_step_more_knows_what_comes() -> None:
     assert seeing is not None
     assert blind.exact_match < 0.6
     assert seeing.exact_match == 1.0
+
+
+def test_wrappers_come_with_the_package() -> None:
+    """Messages and docs name them so."""
+    assert wrappers.History is History

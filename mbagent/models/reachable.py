@@ -33,6 +33,10 @@ class ReachableMDP:
     complete: bool
 
 
+MOST_ROOM = 100_000_000
+"""Entries of a graph's tables of (state, action) that the outcomes of one state may make room for, 16 bytes each."""
+
+
 def grow_reachable(
     model: TransitionModel, start: States, max_states: int, n_samples: int, seed: int = 0
 ) -> tuple[StateGraph, bool]:
@@ -42,12 +46,14 @@ def grow_reachable(
         model: the model to imagine with.
         start: int64 [B, F].
         max_states: number of states expanded at most.
-        n_samples: draws for a (state, action) with too many successors to enumerate.
+        n_samples: draws for a (state, action) with too many successors to enumerate; fewer where there are so many actions
+            that room for their outcomes would be too large.
         seed: which random numbers those draws use.
 
     Returns:
         (graph with one group 0, whether every reachable state was expanded).
     """
+    n_samples = max(1, min(n_samples, MOST_ROOM // (2 * model.n_actions**2)))
     graph = StateGraph(model)
     layer = np.unique(graph.add(start, np.zeros(len(start), dtype=np.int64)))
     expanded = 0
