@@ -179,19 +179,3 @@ def test_goals_see_values_as_the_environment_shows_them() -> None:
     agent.set_reward(lambda obs, action, next_obs: next_obs[:, 0] == 0)
     obs, _ = env.reset()
     assert agent.predict(obs)[0] == 0
-
-
-def test_as_many_actions_as_can_be_enumerated() -> None:
-    """What their outcomes could need at most is not all asked of the memory at once."""
-
-    class Bits12(gym.ActionWrapper[Any, Any, Any]):
-        def __init__(self, env: gym.Env[Any, Any]) -> None:
-            super().__init__(env)
-            self.action_space = spaces.MultiBinary(12)
-
-        def action(self, action: np.ndarray) -> int:
-            return int(action[0])
-
-    env = Bits12(Corridor(limit=50))
-    agent = agent_for(env, 300)
-    assert env.action_space.contains(agent.predict(env.reset(seed=0)[0])[0])

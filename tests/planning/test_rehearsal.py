@@ -41,7 +41,7 @@ def test_in_doubt_the_earlier_way_is_taken() -> None:
 
 
 def test_no_way_is_played_twice_over() -> None:
-    """Three ways as good as each other: 12 episodes of each, from the same states."""
+    """The best so far meets each of the others with the episodes that it has played already."""
     calls: list[tuple[int, int]] = []
 
     def act(way: Way, states: States) -> Actions:

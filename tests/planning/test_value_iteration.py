@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from mbagent.analysis.planning_benchmark.crowds import IndependentModel
 from mbagent.models import SimulatorModel
-from mbagent.models.base import BaseTransitionModel
+from mbagent.models.base import Actions, BaseTransitionModel, States, Successors
 from mbagent.models.reachable import ReachableMDP, grow_reachable
 from mbagent.models.state_graph import StateGraph
 from mbagent.planning.lookahead import grow_lookahead
@@ -220,3 +221,20 @@ class SampledWorld(TableWorld):
     """A table that is only drawn from."""
 
     successors = BaseTransitionModel.successors
+
+
+@pytest.mark.parametrize(("n_actions", "draws"), [(8, 256), (1024, 47), (4096, 2)])
+def test_with_thousands_of_actions_each_is_drawn_less_often(n_actions: int, draws: int) -> None:
+    """Else room for the outcomes of one state, each with a row of all actions, would take tens of gigabytes."""
+    asked = set()
+
+    class Coin(IndependentModel):
+        def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
+            asked.add(n_samples)
+            return super().successors(states, actions, n_samples, seed)
+
+    model = Coin((2,), n_actions, lambda states, actions: np.full((len(states), 1, 2), 0.5))
+    graph, complete = grow_reachable(model, np.zeros((1, 1), dtype=np.int64), 10, 256)
+    assert asked == {draws}
+    assert complete
+    assert len(graph) == 2

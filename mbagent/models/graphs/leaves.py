@@ -58,9 +58,10 @@ class LeafPrior:
     def rates(self, n: Ints, e: Ints, typical: Floats) -> Floats:
         """Posterior mean rate."""
         typical = typical.clip(SURE, 1.0 - SURE)
-        _, slab = self.evidence(n, e, typical)
+        rows, mean = self._slab(n, e, typical)
+        _, slab = _with_spike(rows, self.certain, n, e, typical)
         spike = np.where(n == 0, typical, (e == n) * 1.0)
-        result: Floats = slab * self._slab(n, e, typical)[1] + (1.0 - slab) * spike
+        result: Floats = slab * mean + (1.0 - slab) * spike
         return result
 
     def _slab(self, n: Ints, e: Ints, typical: Floats) -> tuple[Floats, Floats]:
@@ -83,8 +84,8 @@ class MixedPrior(LeafPrior):
     weights: Floats
 
     def _slab(self, n: Ints, e: Ints, typical: Floats) -> tuple[Floats, Floats]:
-        before = special.logsumexp(_likelihoods(0 * n, 0 * e, typical), axis=1, b=self.weights)
-        after = _likelihoods(n, e, typical) + np.log(self.weights)
+        before = special.logsumexp(_likelihoods(0 * n, 0 * e, typical, self.strength), axis=1, b=self.weights)
+        after = _likelihoods(n, e, typical, self.strength) + np.log(self.weights)
         total = special.logsumexp(after, axis=1)
         seen = (n + self.strength)[:, None]
         means = (UP + e[:, None] + self.strength * typical[:, None]) / (UP + DOWN + seen)
@@ -130,18 +131,18 @@ def _with_spike(slab: Floats, certain: float, n: Ints, e: Ints, typical: Floats)
     return total, np.exp(slab - total)
 
 
-def _likelihoods(n: Ints, e: Ints, typical: Floats) -> Floats:
+def _likelihoods(n: Ints, e: Ints, typical: Floats, strength: float) -> Floats:
     """Log-probability [N, K] of the leaves' rows, and of what the typical rate counts for, under each component."""
-    up, down = e + MIXED_STRENGTH * typical, n - e + MIXED_STRENGTH * (1.0 - typical)
+    up, down = e + strength * typical, n - e + strength * (1.0 - typical)
     result: Floats = special.betaln(UP + up[:, None], DOWN + down[:, None]) - special.betaln(UP, DOWN)
     return result
 
 
 def _mixture(certain: float, n: Ints, e: Ints, typical: Floats) -> MixedPrior:
     """The mixture under which leaves are likeliest, by expectation and maximisation from a simple prior on."""
-    rows, before = _likelihoods(n, e, typical), np.exp(_likelihoods(0 * n, 0 * e, typical))
+    rows, before = (_likelihoods(k * n, k * e, typical, MIXED_STRENGTH) for k in (1, 0))
     top = rows.max(axis=1)
-    rows, weights = np.exp(rows - top[:, None]), np.full(len(CENTRES), 1.0 / len(CENTRES))
+    rows, before, weights = np.exp(rows - top[:, None]), np.exp(before), np.full(len(CENTRES), 1.0 / len(CENTRES))
     for _ in range(ROUNDS):
         after, given = rows @ weights, before @ weights
         slab = _with_spike(np.log(after / given) + top, certain, n, e, typical)[1]
