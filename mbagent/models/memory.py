@@ -21,10 +21,10 @@ PART = 2000
 """Transitions looked at at once."""
 
 
-def better(logs: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
-    """Whether log-probabilities [N] are higher than others, of the same transitions, by more than chance."""
+def better(logs: NDArray[np.float64], others: NDArray[np.float64], errors: float = 3.0) -> bool:
+    """Whether log-probabilities [N] are higher than others, of the same transitions, by so many standard errors."""
     gain = logs - others
-    return bool(len(gain) > 1 and gain.mean() > 3.0 * gain.std(ddof=1) / np.sqrt(len(gain)))
+    return bool(len(gain) > 1 and gain.mean() > errors * gain.std(ddof=1) / np.sqrt(len(gain)))
 
 
 def thinned(rows: TransitionBatch, most: int) -> TransitionBatch:

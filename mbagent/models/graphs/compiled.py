@@ -6,12 +6,12 @@ After Chickering, Heckerman and Meek 1997, "A Bayesian approach to learning Baye
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent.models.graphs.habits import Habit
 from mbagent.models.graphs.leaves import LeafPrior, fitted_prior
 from mbagent.models.graphs.search import Search
 from mbagent.models.graphs.units import BEYOND, Layout, Question
@@ -20,10 +20,6 @@ from mbagent_envs._compiled import compiled
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
 Bools: TypeAlias = NDArray[np.bool_]
-
-
-THETAS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0, 1000.0)
-"""Parameters of Ewens' formula to choose from."""
 
 
 class Graphs(NamedTuple):
@@ -117,7 +113,7 @@ def build(layout: Layout, asked: Sequence[Question], found: Sequence[Search], ha
     pairs = np.concatenate([[0], np.cumsum(layout.acts.n_ways * layout.outputs)]).astype(np.int64)
     entries = [np.zeros((0, 3), dtype=np.int64)]
     for question, search in zip(asked, found, strict=True):
-        first = nodes.graph(search, prior)
+        first = nodes.graph(search, prior)[question.context]
         entries.append(np.stack([pairs[question.unit] + question.pairs, question.values, first], axis=1))
     rates = np.asarray(nodes.rates, dtype=np.float64).reshape(-1, 2)
     return Graphs(
@@ -132,50 +128,6 @@ def build(layout: Layout, asked: Sequence[Question], found: Sequence[Search], ha
         np.concatenate([habit.base for habit in habits]),
         np.asarray([still]),
     )
-
-
-@dataclass(frozen=True)
-class Habit:
-    """What a unit does after each pair (way, value), whatever else is the case.
-
-    Attributes:
-        stays: share of a pair's rows in which the unit kept its value, [pairs]; 1 where there are none.
-        novelty: probability that it does what it never did after that pair, [pairs]; where there are no
-            rows, as after one.
-        base: how often each value came anew, [cardinality], summing to one.
-    """
-
-    stays: Floats
-    novelty: Floats
-    base: Floats
-
-
-def habit_of(cardinality: int, n_actions: int, actions: Ints, now: Ints, then: Ints) -> Habit:
-    """A unit's habit in N rows.
-
-    Novelty falls with the rows seen as in Ewens' sampling formula, theta / (rows + theta), with the theta under which what
-    followed each pair is foretold best, each row from the others: large where anything may follow, next to nothing
-    where the same things follow again and again.
-    """
-    size = n_actions * cardinality
-    pair = actions * cardinality + now
-    visits = np.bincount(pair, minlength=size).astype(np.float64)
-    stayed = np.bincount(pair[now == then], minlength=size)
-    stays = np.where(visits > 0, stayed / np.maximum(visits, 1), 1.0)
-    anew = np.bincount(then[now != then], minlength=cardinality) + 0.5
-    base = anew / anew.sum()
-    if cardinality == 2 or len(pair) == 0:
-        return Habit(stays, np.zeros(size), base)
-    met, times = np.unique(pair * cardinality + then, return_counts=True)
-    seen, value = np.divmod(met, cardinality)
-    n, c = visits[seen], times.astype(np.float64)
-
-    def foretold(theta: float) -> float:
-        again = np.where(c > 1, np.log(np.maximum(c - 1, 1)), np.log(theta * base[value]))
-        return float((c * (again - np.log(n - 1 + theta))).sum())
-
-    theta = max(THETAS, key=foretold)
-    return Habit(stays, theta / (np.maximum(visits, 1.0) + theta), base)
 
 
 @compiled

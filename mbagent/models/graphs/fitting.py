@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TypeAlias
 
 import numpy as np
@@ -11,16 +12,16 @@ from numpy.typing import NDArray
 
 from mbagent.models.graphs import draws
 from mbagent.models.graphs.acts import Acts
-from mbagent.models.graphs.compiled import Graphs, build, habit_of
+from mbagent.models.graphs.compiled import Graphs, build
 from mbagent.models.graphs.conditioner import find_dependent, uncertain_rows
 from mbagent.models.graphs.exclusive import find_cliques, find_groups
 from mbagent.models.graphs.greedy import find_splits
+from mbagent.models.graphs.manners import Manner, ask_in, habit_in
 from mbagent.models.graphs.search import Search
 from mbagent.models.graphs.units import (
     Layout,
     Question,
     Seen,
-    ask,
     column_kinds,
     column_table,
     coupled_layout,
@@ -34,6 +35,9 @@ from mbagent.transitions import TransitionBatch
 
 Bools: TypeAlias = NDArray[np.bool_]
 Ints: TypeAlias = NDArray[np.int64]
+
+NO_MANNERS: Mapping[int, Manner] = MappingProxyType({})
+"""All factors are asked where they go."""
 
 SOME_ROWS = 4000
 """Rows on which it is looked at how often bits should be on together."""
@@ -68,11 +72,13 @@ class _Table:
         layout: the units.
         rows: N transitions.
         events: which of them are rare events, bool [N].
-        moving: factors that are asked how far they move.
+        manners: how factors are asked about, if not where they go.
         since: first row that counts for each factor and for ``terminated``, int64 [F + 1]; None for all.
     """
 
-    def __init__(self, layout: Layout, rows: TransitionBatch, events: Bools, moving: Collection[int], since: Ints | None) -> None:
+    def __init__(
+        self, layout: Layout, rows: TransitionBatch, events: Bools, manners: Mapping[int, Manner], since: Ints | None
+    ) -> None:
         """See the class."""
         self.layout, self.rows = layout, rows
         self.since = np.zeros(len(layout.outputs), dtype=np.int64)
@@ -81,7 +87,7 @@ class _Table:
             self.since[:-2] = [since[factors].max() for factors in members[:-2]]
             self.since[-2] = since[-1]
         lone = np.flatnonzero(np.diff(layout.first) == 1)
-        self.moving = lone[np.isin(layout.members[layout.first[lone]], list(moving))]
+        self.manners = {int(unit): manners.get(int(layout.members[layout.first[unit]]), Manner.GOES) for unit in lone}
         flags = np.stack([rows.terminated, events], axis=1).astype(np.uint8)
         self.now = np.concatenate([unit_values(layout, rows.before), np.zeros_like(flags)], axis=1)
         self.then = np.concatenate([unit_values(layout, rows.after), flags], axis=1)
@@ -99,7 +105,7 @@ class _Table:
 
     def questions(self, unit: int, seen: Seen) -> list[Question]:
         """The questions about a unit, of rows with whatever looks."""
-        return ask(unit, int(self.layout.outputs[unit]), seen, unit in self.moving)
+        return ask_in(self.manners.get(unit, Manner.GOES), unit, int(self.layout.outputs[unit]), seen)
 
     def seen(self, unit: int) -> Seen:
         """A unit's values in all rows."""
@@ -116,7 +122,7 @@ class _Table:
         habits = []
         for unit, cardinality in enumerate(self.layout.outputs):
             some = self.seen(unit).select(self.counting(unit, seen))
-            habits.append(habit_of(int(cardinality), self.layout.acts.n_ways, some.actions, some.now, some.then))
+            habits.append(habit_in(self.manners.get(unit, Manner.GOES), int(cardinality), self.layout.acts.n_ways, some))
         return build(self.layout, asked, found, habits, still)
 
 
@@ -132,7 +138,7 @@ def fit_graphs(
     events: Bools,
     in_pairs: bool = True,
     jointly: bool = True,
-    moving: Collection[int] = (),
+    manners: Mapping[int, Manner] = NO_MANNERS,
     since: Ints | None = None,
 ) -> Fitted:
     """Fits everything.
@@ -144,12 +150,12 @@ def fit_graphs(
         events: which of them are rare events, bool [N].
         in_pairs: whether to look for causes that matter only together, which takes most of the time.
         jointly: whether to look for units that hang on what others become.
-        moving: factors that are asked how far they move, and not where they go.
+        manners: how factors are asked about, if not where they go.
         since: first row that counts for each factor and for ``terminated``, int64 [F + 1]; None for all.
     """
     groups = find_groups(cardinalities, rows.before, rows.after, ~events)
     layout = lay_out(cardinalities, groups, acts)
-    table, usual = _Table(layout, rows, events, moving, since), np.flatnonzero(~events)
+    table, usual = _Table(layout, rows, events, manners, since), np.flatnonzero(~events)
     last = len(layout.outputs) - 1
     asked_of = {unit: np.arange(len(rows)) if unit == last else usual for unit in range(last + 1)}
     graphs, asked, found = _graphs(table, asked_of, usual, True, in_pairs)

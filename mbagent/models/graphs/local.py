@@ -15,9 +15,10 @@ from mbagent.models.base import Bools, FitReport, Floats
 from mbagent.models.fit_report import Variable
 from mbagent.models.graphs.arrays import from_arrays, table_of, to_arrays
 from mbagent.models.graphs.channels import find_couplings, learn_channels, learn_late
-from mbagent.models.graphs.compiled import Graphs, build, habit_of
+from mbagent.models.graphs.compiled import Graphs, build
 from mbagent.models.graphs.evidence import Ints
 from mbagent.models.graphs.fitting import Fitted, nothing_late
+from mbagent.models.graphs.habits import habit_of
 from mbagent.models.graphs.instantiate import Coupling, LocalGraphs, instantiate, with_couplings, with_laws
 from mbagent.models.graphs.laws import LAWLESS, Laws, all_kept, find_laws, n_combinations
 from mbagent.models.graphs.looks import PlaneTable, channel_layout
@@ -76,7 +77,8 @@ class LocalGraphModel(DecisionGraphModel):
         """Knows nothing, but how far neighbourhoods reach."""
         self.reach = reach
         columns = relative_columns(cards, self.parts, reach)
-        nothing = [habit_of(k, self.acts.n_ways, *([np.zeros(0, dtype=np.int64)] * 3)) for k in (*cards, 2, 2)]
+        none = np.zeros(0, dtype=np.int64)
+        nothing = [habit_of(k, self.acts.n_ways, none, none, none) for k in (*cards, 2, 2)]
         graphs = build(channel_layout(cards, self.acts), (), (), nothing, 1e-9)
         self.local = LocalGraphs(graphs, nothing_late(graphs), columns, cards, self.acts, ())
         self._instantiate((), ())

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.graphs.acts import Acts
-from mbagent.models.graphs.compiled import Graphs, build, habit_of
+from mbagent.models.graphs.compiled import Graphs, build
 from mbagent.models.graphs.greedy import find_splits
+from mbagent.models.graphs.habits import habit_of
 from mbagent.models.graphs.search import Search
 from mbagent.models.graphs.units import Layout, Question, Seen, ask, distinct, lay_out
 from mbagent.models.graphs.windows import (

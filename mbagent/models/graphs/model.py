@@ -11,19 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.base import (
-    Bools,
-    FitReport,
-    Floats,
-)
+from mbagent.models.base import Bools, FitReport, Floats
 from mbagent.models.fit_report import Variable, VariableReport, describe
 from mbagent.models.graphs.acts import acts_of
 from mbagent.models.graphs.arrays import from_arrays, table_of, to_arrays
-from mbagent.models.graphs.compiled import Graphs, build, habit_of, n_columns
+from mbagent.models.graphs.compiled import Graphs, build, n_columns
 from mbagent.models.graphs.conditioner import AT_ONCE
 from mbagent.models.graphs.events import flag_events
 from mbagent.models.graphs.exclusive import find_groups
 from mbagent.models.graphs.fitting import Fitted, fit_graphs, nothing_late
+from mbagent.models.graphs.habits import habit_of
+from mbagent.models.graphs.manners import Manner
 from mbagent.models.graphs.parents import flat_variables
 from mbagent.models.graphs.predictions import GraphPredictions
 from mbagent.models.graphs.recency import still_true_since
@@ -47,6 +45,9 @@ many, evenly chosen ones are."""
 
 MOST_COUNTS = 20_000_000
 """Contexts times columns of a question about how far a factor moves."""
+
+SUM_ERRORS = 2.0
+"""Standard errors by which a sum must foretell held-out values better: what an action's number is may mean nothing."""
 
 DESCRIBED = 2000
 """Held-out transitions that figures of single variables are made from."""
@@ -101,13 +102,13 @@ class DecisionGraphModel(GraphPredictions):
         if progress is not None:
             progress(0.4)
         flagged = flag_events(train.before, train.after) & events.any()
-        moving = self._moving(train, flagged, held_out)
-        self.fitted = fit_graphs(self.cardinalities, self.acts, train, flagged, moving=moving, since=train_since)
+        manners = self._manners(train, flagged, held_out)
+        self.fitted = fit_graphs(self.cardinalities, self.acts, train, flagged, manners=manners, since=train_since)
         likelihood, jointly = self._jointly(held_out)
         if progress is not None:
             progress(0.7)
         exact, (variables, calibration) = self._exact_match(held_out), self._described(held_out)
-        self.fitted = fit_graphs(self.cardinalities, self.acts, rows, events, True, jointly, moving, since)
+        self.fitted = fit_graphs(self.cardinalities, self.acts, rows, events, True, jointly, manners, since)
         if progress is not None:
             progress(1.0)
         figures = {"nodes": float(len(self.fitted.usual.column)), "events": float(events.sum())}
@@ -251,19 +252,33 @@ class DecisionGraphModel(GraphPredictions):
                 break
         return events & (gain > 0.0)
 
-    def _moving(self, train: TransitionBatch, events: Bools, held_out: TransitionBatch) -> list[int]:
-        """Factors of which held-out values are foretold better by asking how far they move than where they go."""
+    def _manners(self, train: TransitionBatch, events: Bools, held_out: TransitionBatch) -> dict[int, Manner]:
+        """How each factor is asked about: in the manner by which its held-out values are foretold best."""
         n_contexts, n_columns = self.acts.n_ways * max(self.cardinalities, default=0), 2 * sum(self.cardinalities)
         every = [f for f, cardinality in enumerate(self.cardinalities) if cardinality > 2]
         if not every or n_contexts * n_columns > MOST_COUNTS or len(held_out) == 0:
-            return []
-        start, logs = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64), []
-        for moving in ((), every):
-            self.fitted = fit_graphs(self.cardinalities, self.acts, train, events, False, False, moving)
-            probs = self.marginals(held_out.states, held_out.actions)
-            chosen = np.take_along_axis(probs, start[every] + held_out.after[:, every], axis=1)
-            logs.append(np.log(chosen.clip(1e-9)).sum(axis=0))
-        return [f for f, gain in zip(every, logs[1] - logs[0], strict=True) if gain > 0.0]
+            return {}
+        goes, moves = (self._foretold_in(manner, every, train, events, held_out) for manner in (Manner.GOES, Manner.MOVES))
+        best = {f: Manner.MOVES for f, gain in zip(every, (moves - goes).sum(axis=0), strict=True) if gain > 0.0}
+        logs = np.where([f in best for f in every], moves, goes)
+        random = [i for i in range(len(every)) if self.acts.n_ways > 2 and logs[:, i].mean() < FORETOLD]
+        for manner in (Manner.ADDS, Manner.TAKES) if random else ():
+            sums = self._foretold_in(manner, every, train, events, held_out)
+            for i in random:
+                if better(sums[:, i], logs[:, i], SUM_ERRORS):
+                    best[every[i]], logs[:, i] = manner, sums[:, i]
+        return best
+
+    def _foretold_in(
+        self, manner: Manner, factors: list[int], train: TransitionBatch, events: Bools, held_out: TransitionBatch
+    ) -> Floats:
+        """Log-probability of each factor's held-out next value, [N, K], all being asked about in one manner."""
+        self.fitted = fit_graphs(self.cardinalities, self.acts, train, events, False, False, dict.fromkeys(factors, manner))
+        start = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64)
+        probs = self.marginals(held_out.states, held_out.actions)
+        chosen = np.take_along_axis(probs, start[factors] + held_out.after[:, factors], axis=1)
+        logs: Floats = np.log(chosen.clip(1e-9))
+        return logs
 
     def _likelihood(self, fitted: Fitted, rows: TransitionBatch) -> float:
         """Mean log-probability of transitions; the impossible counts as ``IMPOSSIBLE``."""

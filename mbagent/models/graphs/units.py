@@ -8,7 +8,7 @@ value, or an action.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -203,15 +203,17 @@ class Question:
 
     Attributes:
         unit: number of the unit.
-        values: the value in each context, int64 [C].
-        pairs: action times cardinality plus present value, of each context, int64 [C], ascending.
+        values: the value after each pair, int64 [P].
+        pairs: action times cardinality plus present value, of each pair that has an answer, int64 [P], ascending.
         head: the rows.
+        context: the context of each pair, int64 [P]; unless several pairs are one context from the start, each is its own.
     """
 
     unit: int
     values: Ints
     pairs: Ints
     head: Head
+    context: Ints
 
 
 @dataclass(frozen=True)
@@ -235,53 +237,57 @@ class Seen:
         return Seen(self.pattern[rows], self.actions[rows], self.now[rows], self.then[rows])
 
 
-def ask(unit: int, cardinality: int, seen: Seen, moves: bool = False) -> list[Question]:
-    """The questions about one unit; none if it never changes.
+def ask(unit: int, cardinality: int, seen: Seen) -> list[Question]:
+    """The questions about one unit, where it goes; none if it never changes.
 
     Args:
         unit: its number.
         cardinality: number of its values.
         seen: the rows to ask.
-        moves: whether to ask how far it moves, of all values at once, and not where it goes; after the last value comes the
-            first.
     """
     if (seen.now == seen.then).all():
         return []
     if cardinality == 2:
-        return [_question(unit, seen.then, 1, cardinality, seen)]
-    if moves:
-        return _moves(unit, cardinality, seen)
+        return [question(unit, seen.then, 1, cardinality, seen)]
     pair, asked = seen.actions * cardinality + seen.now, []
     for value in np.unique(seen.then[seen.now != seen.then]):
         leading = np.unique(pair[seen.then == value])
         leading = leading[leading % cardinality != value]
         some = seen.select(np.flatnonzero(np.isin(pair, leading)))
-        asked.append(_question(unit, some.then, int(value), cardinality, some))
+        asked.append(question(unit, some.then, int(value), cardinality, some))
     return asked
 
 
-def _moves(unit: int, cardinality: int, seen: Seen) -> list[Question]:
-    """How far a unit moves under the actions that ever moved it so far, whatever its present value, met or not."""
-    far, asked = (seen.then - seen.now) % cardinality, []
-    for move in np.unique(far[far > 0]):
-        leading = np.unique(seen.actions[far == move])
-        rows = np.flatnonzero(np.isin(seen.actions, leading))
-        every = (leading[:, None] * cardinality + np.arange(cardinality)).ravel()
-        question = _question(unit, far[rows], int(move), cardinality, seen.select(rows), every)
-        asked.append(replace(question, values=(every % cardinality + move) % cardinality))
-    return asked
+def question(
+    unit: int, came: Ints, value: int, cardinality: int, seen: Seen, every: Ints | None = None, alike: Ints | None = None
+) -> Question:
+    """Whether ``came`` [R] is some value; in the pairs met, or in ``every`` one of these.
 
-
-def _question(unit: int, came: Ints, value: int, cardinality: int, seen: Seen, every: Ints | None = None) -> Question:
-    """Whether ``came`` [R] is some value; in the contexts met, or in ``every`` one of these."""
+    Args:
+        unit: its number.
+        came: what came in each row, int64 [R].
+        value: what is asked for.
+        cardinality: number of the unit's values.
+        seen: the R rows.
+        every: pairs that get an answer, int64 [P], ascending; None for those met.
+        alike: number of the context of each, int64 [P]; None for one each.
+    """
     n, e = np.bincount(seen.pattern), np.bincount(seen.pattern, weights=came == value).astype(np.int64)
     pair_of = np.empty(len(n), dtype=np.int64)
     pair_of[seen.pattern] = seen.actions * cardinality + seen.now
     rows = np.flatnonzero(n)
     pairs = np.unique(pair_of[rows]) if every is None else every
-    context = np.searchsorted(pairs, pair_of[rows]).astype(np.int64)
-    head = Head(rows, n[rows], e[rows], context, pairs // cardinality, pairs % cardinality)
-    return Question(unit, np.full(len(pairs), value), pairs, head)
+    context = np.arange(len(pairs)) if alike is None else np.unique(alike, return_inverse=True)[1].astype(np.int64)
+    asked, several = np.searchsorted(pairs, pair_of[rows]), np.full(context.max(initial=-1) + 1, -1)
+    head = Head(
+        rows,
+        n[rows],
+        e[rows],
+        context[asked],
+        pairs // cardinality if alike is None else several,
+        pairs % cardinality if alike is None else several,
+    )
+    return Question(unit, np.full(len(pairs), value), pairs, head, context)
 
 
 AT_ONCE = 20_000_000

@@ -1,0 +1,77 @@
+"""Sums of a factor's value and the action's number, less what luck takes, within bounds."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+
+from mbagent.models.graphs import DecisionGraphModel
+from mbagent.models.graphs.manners import Manner, ask_in
+from mbagent.models.graphs.units import Seen
+from tests.models.helpers import dataset
+
+LAST, ORDERS, DEMAND = 12, 6, 3.0
+EVERY = np.stack(np.meshgrid(np.arange(LAST + 1), np.arange(ORDERS), indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def level(stock: NDArray[np.int64], order: NDArray[np.int64], sign: int) -> NDArray[np.int64]:
+    """What is there before luck takes or, where the order is taken out, brings."""
+    return stock + order if sign > 0 else LAST - stock + order
+
+
+def world(n: int, sign: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """A stock that orders fill and demand empties (sign 1), or the free room of one (sign -1)."""
+    rng = np.random.default_rng(0)
+    stock, order = rng.integers(LAST + 1, size=n), rng.integers(ORDERS, size=n)
+    left = np.clip(level(stock, order, sign) - rng.poisson(DEMAND, n), 0, LAST)
+    return stock[:, None], order, (left if sign > 0 else LAST - left)[:, None]
+
+
+def truth(sign: int) -> NDArray[np.float64]:
+    """Distribution of the next stock for every pair (stock, order), [pairs, values]."""
+    probs = np.zeros((len(EVERY), LAST + 1))
+    for demand in range(60):
+        left = np.clip(level(EVERY[:, 0], EVERY[:, 1], sign) - demand, 0, LAST)
+        probs[np.arange(len(EVERY)), left if sign > 0 else LAST - left] += stats.poisson.pmf(demand, DEMAND)
+    return probs
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_an_inventory_is_known_from_few_transitions(sign: int) -> None:
+    model = DecisionGraphModel((LAST + 1,), ORDERS)
+    model.fit(dataset((LAST + 1,), ORDERS, *world(1500, sign)))
+    found = model.marginals(EVERY[:, :1], EVERY[:, 1])[:, : LAST + 1]
+    distance = 0.5 * np.abs(found - truth(sign)).sum(axis=1)
+    assert distance.mean() < 0.06  # 1,500 transitions are 19 of each pair, whose frequencies are .2 away
+    assert distance.max() < 0.15
+
+
+def test_numbers_of_actions_that_mean_nothing_are_not_added() -> None:
+    rng = np.random.default_rng(1)
+    states, actions = rng.integers(9, size=(1500, 1)), rng.integers(5, size=1500)
+    step = np.array([2, -1, 0, 1, -2])[actions] * rng.integers(2, size=1500)
+    model = DecisionGraphModel((9,), 5)
+    model.fit(dataset((9,), 5, states, actions, (states + step[:, None]) % 9))
+    probs = model.marginals(np.repeat(np.arange(9), 5)[:, None], np.tile(np.arange(5), 9))[:, :9]
+    moves = np.array([2, -1, 0, 1, -2])
+    expected = np.zeros((45, 9))
+    for i in range(45):
+        expected[i, i // 5] += 0.5
+        expected[i, (i // 5 + moves[i % 5]) % 9] += 0.5
+    distance = 0.5 * np.abs(probs - expected).sum(axis=1)
+    assert distance.mean() < 0.04  # a rate of 300 coins is .03 off
+
+
+def test_questions_of_sums_cover_every_value_but_the_present_one_once() -> None:
+    now, actions, then = (part.ravel() for part in world(4000, 1))
+    pair = actions * (LAST + 1) + now
+    asked = ask_in(Manner.ADDS, 0, LAST + 1, Seen(pair, actions, now, then))
+    entries = np.concatenate([np.stack([question.pairs, question.values], axis=1) for question in asked])
+    assert len(np.unique(entries, axis=0)) == len(entries)
+    assert (entries[:, 0] % (LAST + 1) != entries[:, 1]).all()
+    assert (entries[:, 1].min(), entries[:, 1].max()) == (0, LAST)
+    met = np.unique(np.stack([pair, then], axis=1)[now != then], axis=0)
+    assert {tuple(row) for row in met.tolist()} <= {tuple(row) for row in entries.tolist()}
+    bound = [question for question in asked if len(np.unique(question.values)) == 1 and question.values[0] == 0][-1]
+    assert bound.head.context.max() + 1 == LAST + ORDERS  # one for each sum
+    assert (bound.head.came.sum(), bound.head.seen.sum()) == ((then == 0).sum(), len(then))
