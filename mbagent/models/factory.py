@@ -8,7 +8,7 @@ from dataclasses import replace
 from mbagent.models.base import BaseTransitionModel, TransitionModel
 from mbagent.models.config import NeuralConfig
 from mbagent.models.forecasts import DirectForecastModel, longest_string
-from mbagent.models.graphs import DecisionGraphModel, LocalGraphModel, channel_cardinalities
+from mbagent.models.graphs import DecisionGraphModel, PlaneGraphModel, channel_cardinalities
 from mbagent.models.neural import NeuralTransitionModel
 from mbagent.models.plane_strings import PlaneStringPredictor
 from mbagent.models.planes import PlanePredictor
@@ -98,10 +98,10 @@ def build_tabular(space: FactoredSpace, n_actions: int, learning_rate: float) ->
 def build_graphs(
     space: FactoredSpace, n_actions: int, learning_rate: float, parts: Sequence[int] | None = None
 ) -> TransitionModel:
-    """Decision graphs over the few things that each variable hangs on; on planes, the same at every position."""
+    """Decision graphs over the few things that each variable hangs on; on planes, if they are, the same at every position."""
     del learning_rate
     if space.planes is not None and channel_cardinalities(space) is not None:
-        return LocalGraphModel(space, n_actions, parts=parts)
+        return PlaneGraphModel(space, n_actions, parts=parts)
     return DecisionGraphModel(space.cardinalities, n_actions, parts=parts)
 
 

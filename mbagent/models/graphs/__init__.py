@@ -2,5 +2,6 @@
 
 from mbagent.models.graphs.local import LocalGraphModel, channel_cardinalities
 from mbagent.models.graphs.model import DecisionGraphModel
+from mbagent.models.graphs.placed import PlaneGraphModel
 
-__all__ = ["DecisionGraphModel", "LocalGraphModel", "channel_cardinalities"]
+__all__ = ["DecisionGraphModel", "LocalGraphModel", "PlaneGraphModel", "channel_cardinalities"]

@@ -1,0 +1,92 @@
+"""Planes on which rules may hang on the place: graphs for all positions, or for each cell, whichever foretells better."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mbagent.models.base import FitReport
+from mbagent.models.graphs.fitting import fit_graphs
+from mbagent.models.graphs.local import LocalGraphModel
+from mbagent.models.graphs.model import FORETOLD, IMPOSSIBLE, DecisionGraphModel
+from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, thinned
+from mbagent.spaces import FactoredSpace
+from mbagent.transitions import TransitionDataset
+
+MOST_CELLS = 2000
+"""Cells of planes of which each is looked at for itself; with more, no rows would be enough."""
+
+
+class PlaneGraphModel(LocalGraphModel):
+    """A LocalGraphModel that learns each cell for itself where that foretells held-out transitions clearly better.
+
+    So it is where planes only write down a place, and what an action does there is another thing at each.
+
+    Attributes:
+        flat: the model of each cell for itself, whose graphs are this one's then; else None.
+    """
+
+    flat: DecisionGraphModel | None = None
+
+    def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
+        """See TransitionModel."""
+        began, self.flat = time.perf_counter(), None
+        report = super().fit(data, seed=seed, progress=progress)
+        if self._hangs_on_place(data, seed):
+            flat = DecisionGraphModel(self.cardinalities, self.n_actions, self.validation, self.parts)
+            report = flat.fit(data, seed=seed, progress=progress)
+            self._take(flat)
+        return replace(report, seconds=time.perf_counter() - began)
+
+    def _take(self, flat: DecisionGraphModel) -> None:
+        self.flat, self.fitted = flat, flat.fitted
+
+    def _hangs_on_place(self, data: TransitionDataset, seed: int) -> bool:
+        """Whether a quick look at each cell for itself foretells held-out transitions better than one at all positions."""
+        train, held_out = data.split(self.validation, seed)
+        some, tests = thinned(train, SOME_ROWS), thinned(held_out, SOME_TESTS)
+        if len(self.cardinalities) > MOST_CELLS or len(tests) < 2 or len(some) == 0:
+            return False
+        local = self._foretold(some, tests)
+        if local.mean() > FORETOLD:
+            return False
+        flat = DecisionGraphModel(self.cardinalities, self.n_actions, parts=self.parts)
+        flat.fitted = fit_graphs(self.cardinalities, self.acts, some, np.zeros(len(some), dtype=np.bool_), False, False)
+        logs = flat.log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
+        return better(np.maximum(logs, IMPOSSIBLE), local)
+
+    def for_space(self, space: FactoredSpace | spaces.Space[Any]) -> LocalGraphModel:
+        """See LocalGraphModel.
+
+        Raises:
+            ValueError: also where rules hang on the place.
+        """
+        if self.flat is not None:
+            raise ValueError(
+                "What this model learned hangs on the place on the planes, so planes of another size are unknown to it."
+            )
+        return super().for_space(space)
+
+    def state_dict(self) -> dict[str, NDArray[Any]]:
+        """See TransitionModel."""
+        return super().state_dict() if self.flat is None else self.flat.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """See TransitionModel.
+
+        Raises:
+            ValueError: the arrays are not those of a model of these planes and actions; nothing is changed then.
+        """
+        if "groups" not in state:
+            super().load_state_dict(state)
+            self.flat = None
+            return
+        flat = DecisionGraphModel(self.cardinalities, self.n_actions, self.validation, self.parts)
+        flat.load_state_dict(state)
+        self._take(flat)
