@@ -38,7 +38,7 @@ class PlaneGraphModel(LocalGraphModel):
         """See TransitionModel."""
         began, self.flat = time.perf_counter(), None
         report = super().fit(data, seed=seed, progress=progress)
-        if self._hangs_on_place(data, seed):
+        if self._hangs_on_place(data, seed, report.predictor_loss):
             flat = DecisionGraphModel(self.cardinalities, self.n_actions, self.validation, self.parts)
             report = flat.fit(data, seed=seed, progress=progress)
             self._take(flat)
@@ -47,19 +47,22 @@ class PlaneGraphModel(LocalGraphModel):
     def _take(self, flat: DecisionGraphModel) -> None:
         self.flat, self.fitted = flat, flat.fitted
 
-    def _hangs_on_place(self, data: TransitionDataset, seed: int) -> bool:
-        """Whether a quick look at each cell for itself foretells held-out transitions better than one at all positions."""
+    def _hangs_on_place(self, data: TransitionDataset, seed: int, loss: float | None) -> bool:
+        """Whether a quick look at each cell for itself foretells held-out transitions better than what was learned of all.
+
+        Args:
+            data: all transitions.
+            seed: of the split.
+            loss: what held-out transitions cost the model of all positions, nats each; None where none was held out.
+        """
         train, held_out = data.split(self.validation, seed)
         some, tests = thinned(train, SOME_ROWS), thinned(held_out, SOME_TESTS)
-        if len(self.cardinalities) > MOST_CELLS or len(tests) < 2 or len(some) == 0:
-            return False
-        local = self._foretold(some, tests)
-        if local.mean() > FORETOLD:
+        if loss is None or loss < -FORETOLD or len(self.cardinalities) > MOST_CELLS or len(tests) < 2:
             return False
         flat = DecisionGraphModel(self.cardinalities, self.n_actions, parts=self.parts)
         flat.fitted = fit_graphs(self.cardinalities, self.acts, some, np.zeros(len(some), dtype=np.bool_), False, False)
         logs = flat.log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
-        return better(np.maximum(logs, IMPOSSIBLE), local)
+        return better(np.maximum(logs, IMPOSSIBLE), np.full(len(logs), -loss))
 
     def for_space(self, space: FactoredSpace | spaces.Space[Any]) -> LocalGraphModel:
         """See LocalGraphModel.

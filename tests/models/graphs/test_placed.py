@@ -8,7 +8,7 @@ from mbagent.models.graphs import PlaneGraphModel
 from mbagent.spaces import FactoredSpace
 from mbagent.transitions import TransitionBatch, TransitionDataset
 
-SIZE = 5
+SIZE = 9
 
 
 def walk(n: int, flip: np.ndarray, seed: int = 0) -> tuple[FactoredSpace, TransitionDataset]:
@@ -29,7 +29,7 @@ def walk(n: int, flip: np.ndarray, seed: int = 0) -> tuple[FactoredSpace, Transi
 
 def test_cells_are_learned_for_themselves_where_rules_hang_on_the_place() -> None:
     flip = np.random.default_rng(3).integers(2, size=(SIZE, SIZE))
-    space, data = walk(1500, flip)
+    space, data = walk(3000, flip)
     model = PlaneGraphModel(space, 2)
     report = model.fit(data)
     assert model.flat is not None
@@ -44,11 +44,11 @@ def test_cells_are_learned_for_themselves_where_rules_hang_on_the_place() -> Non
     again = other.log_prob(rows.states, rows.actions, rows.next_states, rows.terminated)
     np.testing.assert_array_equal(again, model.log_prob(rows.states, rows.actions, rows.next_states, rows.terminated))
     with pytest.raises(ValueError, match="hangs on the place"):
-        other.for_space(spaces.MultiBinary((7, 7)))
+        other.for_space(spaces.MultiBinary((11, 11)))
 
 
 def test_rules_that_are_the_same_everywhere_stay_so() -> None:
-    space, data = walk(800, np.zeros((SIZE, SIZE), dtype=np.int64))
+    space, data = walk(1500, np.zeros((SIZE, SIZE), dtype=np.int64))
     model = PlaneGraphModel(space, 2)
     report = model.fit(data)
     assert model.flat is None
@@ -56,4 +56,4 @@ def test_rules_that_are_the_same_everywhere_stay_so() -> None:
     other = PlaneGraphModel(space, 2)
     other.load_state_dict(model.state_dict())
     assert other.flat is None
-    assert model.for_space(spaces.MultiBinary((7, 7))).cardinalities == (2,) * 49
+    assert model.for_space(spaces.MultiBinary((11, 11))).cardinalities == (2,) * 121
