@@ -105,7 +105,8 @@ class _Table:
 
     def questions(self, unit: int, seen: Seen) -> list[Question]:
         """The questions about a unit, of rows with whatever looks."""
-        return ask_in(self.manners.get(unit, Manner.GOES), unit, int(self.layout.outputs[unit]), seen)
+        manner, n_ways = self.manners.get(unit, Manner.GOES), self.layout.acts.n_ways
+        return ask_in(manner, unit, int(self.layout.outputs[unit]), n_ways, seen)
 
     def seen(self, unit: int) -> Seen:
         """A unit's values in all rows."""

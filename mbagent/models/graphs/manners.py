@@ -37,18 +37,19 @@ class Manner(Enum):
         return {Manner.ADDS: 1, Manner.TAKES: -1}.get(self, 0)
 
 
-def ask_in(manner: Manner, unit: int, cardinality: int, seen: Seen) -> list[Question]:
+def ask_in(manner: Manner, unit: int, cardinality: int, n_actions: int, seen: Seen) -> list[Question]:
     """The questions about one unit; none if it never changes.
 
     Args:
         manner: how to ask; units of two values are asked where they go.
         unit: its number.
         cardinality: number of its values.
+        n_actions: number of ways of actions, met or not.
         seen: the rows to ask.
     """
     if manner is Manner.GOES or cardinality == 2 or (seen.now == seen.then).all():
         return ask(unit, cardinality, seen)
-    return _moves(unit, cardinality, seen) if manner is Manner.MOVES else _sums(unit, cardinality, seen, manner.sign)
+    return _moves(unit, cardinality, seen) if manner is Manner.MOVES else _sums(unit, cardinality, n_actions, seen, manner.sign)
 
 
 def _moves(unit: int, cardinality: int, seen: Seen) -> list[Question]:
@@ -66,10 +67,12 @@ def _moves(unit: int, cardinality: int, seen: Seen) -> list[Question]:
     return asked
 
 
-def _sums(unit: int, cardinality: int, seen: Seen, sign: int) -> list[Question]:
-    """How far from the sum a unit ends within its bounds, and for either bound whether it ends there, given the sum."""
-    last, n_ways = cardinality - 1, int(seen.actions.max()) + 1
-    every = np.arange(n_ways * cardinality)
+def _sums(unit: int, cardinality: int, n_actions: int, seen: Seen, sign: int) -> list[Question]:
+    """How far from the sum a unit ends within its bounds, and for either bound whether it ends there, given the sum.
+
+    Sums that were never met are taken for the nearest one that was.
+    """
+    last, every = cardinality - 1, np.arange(n_actions * cardinality)
     sums, here = every % cardinality + sign * (every // cardinality), seen.now + sign * seen.actions
     inside, asked = (seen.then > 0) & (seen.then < last), []
     for far in np.unique((seen.then - here)[inside]):
@@ -77,8 +80,10 @@ def _sums(unit: int, cardinality: int, seen: Seen, sign: int) -> list[Question]:
         pairs = every[(sums + far > 0) & (sums + far < last)]
         one = question(unit, (seen.then - here)[rows], int(far), cardinality, seen.select(rows), pairs)
         asked.append(_elsewhere(replace(one, values=pairs % cardinality + sign * (pairs // cardinality) + far), cardinality))
+    met = np.unique(here)
+    nearest = np.searchsorted((met[:-1] + met[1:]) / 2, sums)
     for bound in np.intersect1d((0, last), seen.then):
-        one = question(unit, seen.then, int(bound), cardinality, seen, every, sums - sums.min())
+        one = question(unit, seen.then, int(bound), cardinality, seen, every, nearest)
         asked.append(_elsewhere(one, cardinality))
     return asked
 

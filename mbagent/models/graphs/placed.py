@@ -12,12 +12,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mbagent.models.base import FitReport
+from mbagent.models.graphs.evidence import Ints
 from mbagent.models.graphs.fitting import fit_graphs
 from mbagent.models.graphs.local import LocalGraphModel
 from mbagent.models.graphs.model import FORETOLD, IMPOSSIBLE, DecisionGraphModel
 from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, thinned
 from mbagent.spaces import FactoredSpace
-from mbagent.transitions import TransitionDataset
+from mbagent.transitions import TransitionBatch, TransitionDataset
 
 MOST_CELLS = 2000
 """Cells of planes of which each is looked at for itself; with more, no rows would be enough."""
@@ -38,26 +39,33 @@ class PlaneGraphModel(LocalGraphModel):
         """See TransitionModel."""
         began, self.flat = time.perf_counter(), None
         report = super().fit(data, seed=seed, progress=progress)
-        if self._hangs_on_place(data, seed, report.predictor_loss):
+        train, held_out = self._parts
+        del self._parts
+        if self._hangs_on_place(train, held_out, report.predictor_loss):
             flat = DecisionGraphModel(self.cardinalities, self.n_actions, self.validation, self.parts)
-            report = flat.fit(data, seed=seed, progress=progress)
+            report = flat.fit(data, seed=seed)
             self._take(flat)
         return replace(report, seconds=time.perf_counter() - began)
 
     def _take(self, flat: DecisionGraphModel) -> None:
         self.flat, self.fitted = flat, flat.fitted
 
-    def _hangs_on_place(self, data: TransitionDataset, seed: int, loss: float | None) -> bool:
+    def _split(self, data: TransitionDataset, seed: int, since: Ints) -> tuple[TransitionBatch, TransitionBatch, Ints]:
+        """As always; the parts are kept until the fit ends, so that either model is judged by the same transitions."""
+        train, held_out, train_since = super()._split(data, seed, since)
+        self._parts = train.select(np.arange(train_since.max(), len(train))), held_out  # as the rules are now
+        return train, held_out, train_since
+
+    def _hangs_on_place(self, train: TransitionBatch, held_out: TransitionBatch, loss: float | None) -> bool:
         """Whether a quick look at each cell for itself foretells held-out transitions better than what was learned of all.
 
         Args:
-            data: all transitions.
-            seed: of the split.
+            train: transitions to learn from.
+            held_out: those held out.
             loss: what held-out transitions cost the model of all positions, nats each; None where none was held out.
         """
-        train, held_out = data.split(self.validation, seed)
         some, tests = thinned(train, SOME_ROWS), thinned(held_out, SOME_TESTS)
-        if loss is None or loss < -FORETOLD or len(self.cardinalities) > MOST_CELLS or len(tests) < 2:
+        if loss is None or loss < -FORETOLD or len(self.cardinalities) > MOST_CELLS or min(len(some), len(tests)) < 2:
             return False
         flat = DecisionGraphModel(self.cardinalities, self.n_actions, parts=self.parts)
         flat.fitted = fit_graphs(self.cardinalities, self.acts, some, np.zeros(len(some), dtype=np.bool_), False, False)

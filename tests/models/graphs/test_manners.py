@@ -65,7 +65,7 @@ def test_numbers_of_actions_that_mean_nothing_are_not_added() -> None:
 def test_questions_of_sums_cover_every_value_but_the_present_one_once() -> None:
     now, actions, then = (part.ravel() for part in world(4000, 1))
     pair = actions * (LAST + 1) + now
-    asked = ask_in(Manner.ADDS, 0, LAST + 1, Seen(pair, actions, now, then))
+    asked = ask_in(Manner.ADDS, 0, LAST + 1, ORDERS, Seen(pair, actions, now, then))
     entries = np.concatenate([np.stack([question.pairs, question.values], axis=1) for question in asked])
     assert len(np.unique(entries, axis=0)) == len(entries)
     assert (entries[:, 0] % (LAST + 1) != entries[:, 1]).all()
@@ -75,3 +75,14 @@ def test_questions_of_sums_cover_every_value_but_the_present_one_once() -> None:
     bound = [question for question in asked if len(np.unique(question.values)) == 1 and question.values[0] == 0][-1]
     assert bound.head.context.max() + 1 == LAST + ORDERS  # one for each sum
     assert (bound.head.came.sum(), bound.head.seen.sum()) == ((then == 0).sum(), len(then))
+
+
+def test_orders_that_were_never_made_are_known_from_those_that_were() -> None:
+    states, actions, following = world(5000, 1)
+    some = actions < ORDERS - 1
+    model = DecisionGraphModel((LAST + 1,), ORDERS)
+    model.fit(dataset((LAST + 1,), ORDERS, states[some], actions[some], following[some]))
+    new = EVERY[EVERY[:, 1] == ORDERS - 1][: LAST - ORDERS]
+    found = model.marginals(new[:, :1], new[:, 1])[:, : LAST + 1]
+    distance = 0.5 * np.abs(found - truth(1)[EVERY[:, 1] == ORDERS - 1][: len(new)]).sum(axis=1)
+    assert distance.max() < 0.15
