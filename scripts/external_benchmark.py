@@ -50,7 +50,7 @@ class Args:
     episodes: int | None = None
     """Episodes after each learning; by default 30, with --full 100."""
     steps: int | None = None
-    """Environment steps for learning; by default 20,000, FrozenLake 8x8 50,000."""
+    """Environment steps for learning; by default 20,000, FrozenLake 8x8 50,000, Inventory and DeepSea 3,000."""
     baseline_steps: int | None = None
     """Steps for PPO and DQN; by default the same."""
     reward_scale: float | None = None
@@ -83,7 +83,7 @@ def plan(args: Args) -> list[Task]:
     for world in map(find_world, args.worlds):
         steps = args.steps or world.steps
         for agent in args.agents:
-            if world.missing is None and not (agent == TRUE and world.kind in ("binned", "minatar")):
+            if world.missing is None and not (agent == TRUE and world.kind in ("binned", "minatar", "planes")):
                 more = [
                     Task(world, agent, args.first_seed + i, steps, episodes, args.baseline_steps or steps, args.reward_scale)
                     for i in range(seeds)

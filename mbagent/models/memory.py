@@ -20,6 +20,9 @@ SOME_ROWS, SOME_TESTS = 2500, 1000
 PART = 2000
 """Transitions looked at at once."""
 
+FORETOLD = -1e-3
+"""Mean log-probability from which on nothing is left to find."""
+
 
 def better(logs: NDArray[np.float64], others: NDArray[np.float64], errors: float = 3.0) -> bool:
     """Whether log-probabilities [N] are higher than others, of the same transitions, by so many standard errors."""

@@ -57,7 +57,10 @@ class Exact:
 
 
 def exact_toy_text(env: gym.Env[Any, Any]) -> Exact:
-    """A toy_text environment with a step limit, as tables."""
+    """A toy_text environment with a step limit, or another with tables like theirs, as tables.
+
+    Where what is seen of a state is not its number, ``unwrapped.observations`` [S, ...] says what is.
+    """
     inner: Any = env.unwrapped
     assert env.spec is not None
     assert env.spec.max_episode_steps is not None
@@ -68,7 +71,8 @@ def exact_toy_text(env: gym.Env[Any, Any]) -> Exact:
             rewards[state, action] += probability * reward
             going[state, action, following] += probability * (not over)
     start = np.asarray(inner.initial_state_distrib, dtype=np.float64)
-    return Exact(np.arange(n_states), going, rewards, start, env.spec.max_episode_steps)
+    observations = getattr(inner, "observations", np.arange(n_states))
+    return Exact(observations, going, rewards, start, env.spec.max_episode_steps)
 
 
 def exact_rddl(tables: RddlTables, horizon: int) -> Exact:

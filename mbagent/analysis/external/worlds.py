@@ -18,6 +18,7 @@ from mbagent.adapters.minigrid import make_minigrid
 from mbagent.adapters.rddl import RddlEnv
 from mbagent.analysis.cases import Scale
 from mbagent.analysis.evaluation import evaluate_env, random_policy
+from mbagent.analysis.external import made  # noqa: F401 - registers
 from mbagent.analysis.external.exact import Exact, exact_rddl, exact_toy_text
 from mbagent.analysis.external.rddl_truth import RddlModel, RddlTables, rddl_tables
 from mbagent.analysis.external.snapshots import SnapshotModel
@@ -35,8 +36,9 @@ class World:
 
     Attributes:
         name: what the results call it.
-        kind: which package it is from; "binned" for continuous ones, cut into bins.
-        target: id for ``gym.make``, or name of an RDDL domain.
+        kind: which package it is from, or is like; "binned" for continuous ones, cut into bins, "planes" for tables of which
+            planes are seen.
+        target: id for ``gym.make``, or name of an RDDL domain or of a game.
         kwargs: further arguments.
         steps: environment steps for learning.
         bins: of each dimension, where it is binned.
@@ -45,7 +47,7 @@ class World:
     """
 
     name: str
-    kind: Literal["toy_text", "rddl", "minigrid", "binned", "minatar"]
+    kind: Literal["toy_text", "rddl", "minigrid", "binned", "minatar", "planes"]
     target: str
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     steps: int = 20_000
@@ -90,6 +92,8 @@ WORLDS = (
     World("SkillTeaching", "rddl", "SkillTeaching_MDP_ippc2011"),
     World("MiniGrid Empty", "minigrid", "MiniGrid-Empty-5x5-v0"),
     World("MiniGrid Dynamic-Obstacles", "minigrid", "MiniGrid-Dynamic-Obstacles-5x5-v0"),
+    World("Inventory", "toy_text", "mbagent/Inventory-v0", steps=3000),
+    World("DeepSea", "planes", "mbagent/DeepSea-v0", steps=3000),
 )
 """The development set; the agent's defaults are the same for all."""
 
@@ -129,7 +133,7 @@ def tables_of(target: str) -> RddlTables:
 
 def exact_world(world: World) -> Exact | None:
     """A world as tables; None where its rules are not at hand."""
-    if world.kind == "toy_text":
+    if world.kind in ("toy_text", "planes"):
         return exact_toy_text(world.make())
     return _exact_rddl(world.target) if world.kind == "rddl" else None
 

@@ -22,13 +22,13 @@ from mbagent.models.graphs.habits import habit_of
 from mbagent.models.graphs.instantiate import Coupling, LocalGraphs, instantiate, with_couplings, with_laws
 from mbagent.models.graphs.laws import LAWLESS, Laws, all_kept, find_laws, n_combinations
 from mbagent.models.graphs.looks import PlaneTable, channel_layout
-from mbagent.models.graphs.model import FORETOLD, DecisionGraphModel
+from mbagent.models.graphs.model import DecisionGraphModel
 from mbagent.models.graphs.parents import asked_columns, hangs_on_action
 from mbagent.models.graphs.recency import still_true_since
 from mbagent.models.graphs.search import Search
 from mbagent.models.graphs.units import Question
 from mbagent.models.graphs.windows import NEXT, NEXT_MEETING, Reach, named_column, relative_columns
-from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, thinned
+from mbagent.models.memory import FORETOLD, SOME_ROWS, SOME_TESTS, better, thinned
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.transitions import TransitionBatch, TransitionDataset
 

@@ -6,6 +6,7 @@ sum: what luck takes is asked of all stocks and orders at once, and at either bo
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from enum import Enum
 from typing import TypeAlias
@@ -13,8 +14,11 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent.models.base import Bools, Floats
 from mbagent.models.graphs.habits import Habit, Pools, habit_of
 from mbagent.models.graphs.units import Question, Seen, ask, question
+from mbagent.models.memory import FORETOLD, better
+from mbagent.transitions import TransitionBatch
 
 Ints: TypeAlias = NDArray[np.int64]
 
@@ -24,17 +28,63 @@ SELDOM = 1e-9
 
 
 class Manner(Enum):
-    """How a factor is asked about; a sum or a difference is that of its value and the action's number."""
+    """How a factor is asked about; a sum or a difference is that of its value and the action's number.
+
+    What is beyond the bounds counts in some sums, and is lost before luck comes in others: those fill or drain.
+    """
 
     GOES = "goes"
     MOVES = "moves"
     ADDS = "adds"
     TAKES = "takes"
+    FILLS = "fills"
+    DRAINS = "drains"
 
-    @property
-    def sign(self) -> int:
-        """What the action's number counts in the sum."""
-        return {Manner.ADDS: 1, Manner.TAKES: -1}.get(self, 0)
+    def sum_of(self, values: Ints, actions: Ints, last: int) -> Ints:
+        """The sum of present values and the actions' numbers, or their difference."""
+        sums = values + actions if self in (Manner.ADDS, Manner.FILLS) else values - actions
+        return np.clip(sums, 0, last) if self in (Manner.FILLS, Manner.DRAINS) else sums
+
+
+SUMS = (Manner.ADDS, Manner.TAKES, Manner.FILLS, Manner.DRAINS)
+"""Manners that ask of sums."""
+
+SUM_ERRORS = 2.0
+"""Standard errors by which a sum must foretell held-out values better: what an action's number is may mean nothing."""
+
+ENOUGH, MOST_FOLDS = 500, 6
+"""So many held-out rows tell which manner fits; where there are fewer, others are held out, too, so many times in all."""
+
+
+def best_manners(foretold: Callable[[Manner], Floats], n_actions: int) -> list[Manner]:
+    """The manner in which each of K factors is foretold best.
+
+    Sums are looked at where something is left to foretell, and there are actions enough to tell a sum from two kinds of moves.
+
+    Args:
+        foretold: log-probabilities of held-out next values where all are asked about in some manner, [N, K].
+        n_actions: number of ways of actions.
+    """
+    logs, moves = foretold(Manner.GOES), foretold(Manner.MOVES)
+    moving = (moves - logs).sum(axis=0) > 0.0
+    best, logs = [Manner.MOVES if there else Manner.GOES for there in moving], np.where(moving, moves, logs)
+    random = np.flatnonzero(logs.mean(axis=0) < FORETOLD)
+    if not len(random) or n_actions < 3:
+        return best
+    sums = np.stack([foretold(manner) for manner in SUMS])
+    for i in random:
+        most = int(sums[:, :, i].mean(axis=1).argmax())
+        if better(sums[most, :, i], logs[:, i], SUM_ERRORS):
+            best[i] = SUMS[most]
+    return best
+
+
+def more_folds(train: TransitionBatch, held_out: TransitionBatch) -> list[Bools]:
+    """Which rows to hold out, besides those that are, where these are too few to tell manners apart, [folds][N]."""
+    if (n := len(train) // MOST_FOLDS) == 0:
+        return []
+    folds = min(MOST_FOLDS - 1, -(-(ENOUGH - len(held_out)) // n))
+    return [np.arange(len(train)) // n == fold for fold in range(folds)]
 
 
 def ask_in(manner: Manner, unit: int, cardinality: int, n_actions: int, seen: Seen) -> list[Question]:
@@ -49,7 +99,7 @@ def ask_in(manner: Manner, unit: int, cardinality: int, n_actions: int, seen: Se
     """
     if manner is Manner.GOES or cardinality == 2 or (seen.now == seen.then).all():
         return ask(unit, cardinality, seen)
-    return _moves(unit, cardinality, seen) if manner is Manner.MOVES else _sums(unit, cardinality, n_actions, seen, manner.sign)
+    return _sums(manner, unit, cardinality, n_actions, seen) if manner in SUMS else _moves(unit, cardinality, seen)
 
 
 def _moves(unit: int, cardinality: int, seen: Seen) -> list[Question]:
@@ -67,19 +117,19 @@ def _moves(unit: int, cardinality: int, seen: Seen) -> list[Question]:
     return asked
 
 
-def _sums(unit: int, cardinality: int, n_actions: int, seen: Seen, sign: int) -> list[Question]:
+def _sums(manner: Manner, unit: int, cardinality: int, n_actions: int, seen: Seen) -> list[Question]:
     """How far from the sum a unit ends within its bounds, and for either bound whether it ends there, given the sum.
 
     Sums that were never met are taken for the nearest one that was.
     """
     last, every = cardinality - 1, np.arange(n_actions * cardinality)
-    sums, here = every % cardinality + sign * (every // cardinality), seen.now + sign * seen.actions
+    sums, here = (manner.sum_of(*of, last) for of in ((every % cardinality, every // cardinality), (seen.now, seen.actions)))
     inside, asked = (seen.then > 0) & (seen.then < last), []
     for far in np.unique((seen.then - here)[inside]):
         rows = np.flatnonzero((here + far > 0) & (here + far < last))
-        pairs = every[(sums + far > 0) & (sums + far < last)]
-        one = question(unit, (seen.then - here)[rows], int(far), cardinality, seen.select(rows), pairs)
-        asked.append(_elsewhere(replace(one, values=pairs % cardinality + sign * (pairs // cardinality) + far), cardinality))
+        there = (sums + far > 0) & (sums + far < last)
+        one = question(unit, (seen.then - here)[rows], int(far), cardinality, seen.select(rows), every[there])
+        asked.append(_elsewhere(replace(one, values=sums[there] + far), cardinality))
     met = np.unique(here)
     nearest = np.searchsorted((met[:-1] + met[1:]) / 2, sums)
     for bound in np.intersect1d((0, last), seen.then):
@@ -102,12 +152,12 @@ def habit_in(manner: Manner, cardinality: int, n_actions: int, seen: Seen) -> Ha
     if manner is Manner.MOVES:
         pools = Pools(every // cardinality, (seen.then - seen.now) % cardinality)
         return habit_of(cardinality, n_actions, seen.actions, seen.now, seen.then, pools)
-    sums, here = every % cardinality + manner.sign * (every // cardinality), seen.now + manner.sign * seen.actions
-    far, inside = seen.then - here, (seen.then > 0) & (seen.then < cardinality - 1)
+    value, last = every % cardinality, cardinality - 1
+    sums, here = manner.sum_of(value, every // cardinality, last), manner.sum_of(seen.now, seen.actions, last)
+    far, inside = seen.then - here, (seen.then > 0) & (seen.then < last)
     pools = Pools(np.zeros_like(every), np.where(inside, far - far.min(), np.ptp(far) + 1 + seen.then))
     habit = habit_of(cardinality, n_actions, seen.actions, seen.now, seen.then, pools)
-    value = every % cardinality
-    met = np.isin(value - sums, far[inside]) & (value > 0) & (value < cardinality - 1)
-    for bound in (0, cardinality - 1):
+    met = np.isin(value - sums, far[inside]) & (value > 0) & (value < last)
+    for bound in (0, last):
         met |= (value == bound) & np.isin(sums, here[seen.then == bound])
     return replace(habit, stays=np.where(met, SELDOM, 0.0))

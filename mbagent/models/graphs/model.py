@@ -21,12 +21,12 @@ from mbagent.models.graphs.events import flag_events
 from mbagent.models.graphs.exclusive import find_groups
 from mbagent.models.graphs.fitting import Fitted, fit_graphs, nothing_late
 from mbagent.models.graphs.habits import habit_of
-from mbagent.models.graphs.manners import Manner
+from mbagent.models.graphs.manners import Manner, best_manners, more_folds
 from mbagent.models.graphs.parents import flat_variables
 from mbagent.models.graphs.predictions import GraphPredictions
 from mbagent.models.graphs.recency import still_true_since
 from mbagent.models.graphs.units import coupled_layout, is_lone_bit, lay_out
-from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, steps_in_a_row, thinned, with_past, within
+from mbagent.models.memory import FORETOLD, SOME_ROWS, SOME_TESTS, better, steps_in_a_row, thinned, with_past, within
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.transitions import TransitionBatch, TransitionDataset
 
@@ -46,17 +46,11 @@ many, evenly chosen ones are."""
 MOST_COUNTS = 20_000_000
 """Contexts times columns of a question about how far a factor moves."""
 
-SUM_ERRORS = 2.0
-"""Standard errors by which a sum must foretell held-out values better: what an action's number is may mean nothing."""
-
 DESCRIBED = 2000
 """Held-out transitions that figures of single variables are made from."""
 
 WORTH = 0.03
 """What the past tells is worth telling beyond this share of what cannot be foretold, plus one nat."""
-
-FORETOLD = -1e-3
-"""Mean log-probability from which on nothing is left to find."""
 
 
 class DecisionGraphModel(GraphPredictions):
@@ -258,16 +252,15 @@ class DecisionGraphModel(GraphPredictions):
         every = [f for f, cardinality in enumerate(self.cardinalities) if cardinality > 2]
         if not every or n_contexts * n_columns > MOST_COUNTS or len(held_out) == 0:
             return {}
-        goes, moves = (self._foretold_in(manner, every, train, events, held_out) for manner in (Manner.GOES, Manner.MOVES))
-        best = {f: Manner.MOVES for f, gain in zip(every, (moves - goes).sum(axis=0), strict=True) if gain > 0.0}
-        logs = np.where([f in best for f in every], moves, goes)
-        random = [i for i in range(len(every)) if self.acts.n_ways > 2 and logs[:, i].mean() < FORETOLD]
-        for manner in (Manner.ADDS, Manner.TAKES) if random else ():
-            sums = self._foretold_in(manner, every, train, events, held_out)
-            for i in random:
-                if better(sums[:, i], logs[:, i], SUM_ERRORS):
-                    best[every[i]], logs[:, i] = manner, sums[:, i]
-        return best
+        folds = [
+            (train, events, held_out),
+            *((train.select(~out), events[~out], train.select(out)) for out in more_folds(train, held_out)),
+        ]
+
+        def foretold(manner: Manner) -> Floats:
+            return np.concatenate([self._foretold_in(manner, every, *fold) for fold in folds])
+
+        return dict(zip(every, best_manners(foretold, self.acts.n_ways), strict=True))
 
     def _foretold_in(
         self, manner: Manner, factors: list[int], train: TransitionBatch, events: Bools, held_out: TransitionBatch

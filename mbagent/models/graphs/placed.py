@@ -15,8 +15,8 @@ from mbagent.models.base import FitReport
 from mbagent.models.graphs.evidence import Ints
 from mbagent.models.graphs.fitting import fit_graphs
 from mbagent.models.graphs.local import LocalGraphModel
-from mbagent.models.graphs.model import FORETOLD, IMPOSSIBLE, DecisionGraphModel
-from mbagent.models.memory import SOME_ROWS, SOME_TESTS, better, thinned
+from mbagent.models.graphs.model import IMPOSSIBLE, DecisionGraphModel
+from mbagent.models.memory import FORETOLD, SOME_ROWS, SOME_TESTS, better, thinned
 from mbagent.spaces import FactoredSpace
 from mbagent.transitions import TransitionBatch, TransitionDataset
 

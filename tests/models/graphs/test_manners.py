@@ -6,44 +6,51 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from mbagent.models.graphs import DecisionGraphModel
-from mbagent.models.graphs.manners import Manner, ask_in
+from mbagent.models.graphs.manners import SUMS, Manner, ask_in
 from mbagent.models.graphs.units import Seen
 from tests.models.helpers import dataset
 
 LAST, ORDERS, DEMAND = 12, 6, 3.0
 EVERY = np.stack(np.meshgrid(np.arange(LAST + 1), np.arange(ORDERS), indexing="ij"), axis=-1).reshape(-1, 2)
 
-
-def level(stock: NDArray[np.int64], order: NDArray[np.int64], sign: int) -> NDArray[np.int64]:
-    """What is there before luck takes or, where the order is taken out, brings."""
-    return stock + order if sign > 0 else LAST - stock + order
+Ints = NDArray[np.int64]
 
 
-def world(n: int, sign: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """A stock that orders fill and demand empties (sign 1), or the free room of one (sign -1)."""
+def following(manner: Manner, value: Ints, action: Ints, luck: Ints) -> Ints:
+    """What comes of a stock that orders fill and demand empties, or of a queue that is served and that luck makes longer."""
+    stocks = manner in (Manner.ADDS, Manner.FILLS)
+    level = value + action if stocks else value - action
+    if manner in (Manner.FILLS, Manner.DRAINS):  # what there is no room for is gone before luck comes
+        level = level.clip(0, LAST)
+    after: Ints = np.clip(level - luck if stocks else level + luck, 0, LAST)
+    return after
+
+
+def world(n: int, manner: Manner) -> tuple[Ints, Ints, Ints]:
+    """Transitions of one."""
     rng = np.random.default_rng(0)
-    stock, order = rng.integers(LAST + 1, size=n), rng.integers(ORDERS, size=n)
-    left = np.clip(level(stock, order, sign) - rng.poisson(DEMAND, n), 0, LAST)
-    return stock[:, None], order, (left if sign > 0 else LAST - left)[:, None]
+    value, action = rng.integers(LAST + 1, size=n), rng.integers(ORDERS, size=n)
+    return value[:, None], action, following(manner, value, action, rng.poisson(DEMAND, n))[:, None]
 
 
-def truth(sign: int) -> NDArray[np.float64]:
-    """Distribution of the next stock for every pair (stock, order), [pairs, values]."""
+def truth(manner: Manner) -> NDArray[np.float64]:
+    """Distribution of what follows every pair (value, action), [pairs, values]."""
     probs = np.zeros((len(EVERY), LAST + 1))
-    for demand in range(60):
-        left = np.clip(level(EVERY[:, 0], EVERY[:, 1], sign) - demand, 0, LAST)
-        probs[np.arange(len(EVERY)), left if sign > 0 else LAST - left] += stats.poisson.pmf(demand, DEMAND)
+    for luck in range(60):
+        after = following(manner, EVERY[:, 0], EVERY[:, 1], np.full(len(EVERY), luck))
+        probs[np.arange(len(EVERY)), after] += stats.poisson.pmf(luck, DEMAND)
     return probs
 
 
-@pytest.mark.parametrize("sign", [1, -1])
-def test_an_inventory_is_known_from_few_transitions(sign: int) -> None:
+@pytest.mark.parametrize("manner", SUMS)
+@pytest.mark.parametrize(("n", "mean", "most"), [(500, 0.1, 0.5), (1500, 0.06, 0.15)])
+def test_stocks_and_queues_are_known_from_few_transitions(manner: Manner, n: int, mean: float, most: float) -> None:
     model = DecisionGraphModel((LAST + 1,), ORDERS)
-    model.fit(dataset((LAST + 1,), ORDERS, *world(1500, sign)))
+    model.fit(dataset((LAST + 1,), ORDERS, *world(n, manner)))
     found = model.marginals(EVERY[:, :1], EVERY[:, 1])[:, : LAST + 1]
-    distance = 0.5 * np.abs(found - truth(sign)).sum(axis=1)
-    assert distance.mean() < 0.06  # 1,500 transitions are 19 of each pair, whose frequencies are .2 away
-    assert distance.max() < 0.15
+    distance = 0.5 * np.abs(found - truth(manner)).sum(axis=1)
+    assert distance.mean() < mean  # 1,500 transitions are 19 of each pair, whose frequencies are .2 away
+    assert distance.max() < most
 
 
 def test_numbers_of_actions_that_mean_nothing_are_not_added() -> None:
@@ -63,7 +70,7 @@ def test_numbers_of_actions_that_mean_nothing_are_not_added() -> None:
 
 
 def test_questions_of_sums_cover_every_value_but_the_present_one_once() -> None:
-    now, actions, then = (part.ravel() for part in world(4000, 1))
+    now, actions, then = (part.ravel() for part in world(4000, Manner.ADDS))
     pair = actions * (LAST + 1) + now
     asked = ask_in(Manner.ADDS, 0, LAST + 1, ORDERS, Seen(pair, actions, now, then))
     entries = np.concatenate([np.stack([question.pairs, question.values], axis=1) for question in asked])
@@ -78,11 +85,11 @@ def test_questions_of_sums_cover_every_value_but_the_present_one_once() -> None:
 
 
 def test_orders_that_were_never_made_are_known_from_those_that_were() -> None:
-    states, actions, following = world(5000, 1)
+    states, actions, after = world(5000, Manner.ADDS)
     some = actions < ORDERS - 1
     model = DecisionGraphModel((LAST + 1,), ORDERS)
-    model.fit(dataset((LAST + 1,), ORDERS, states[some], actions[some], following[some]))
+    model.fit(dataset((LAST + 1,), ORDERS, states[some], actions[some], after[some]))
     new = EVERY[EVERY[:, 1] == ORDERS - 1][: LAST - ORDERS]
     found = model.marginals(new[:, :1], new[:, 1])[:, : LAST + 1]
-    distance = 0.5 * np.abs(found - truth(1)[EVERY[:, 1] == ORDERS - 1][: len(new)]).sum(axis=1)
+    distance = 0.5 * np.abs(found - truth(Manner.ADDS)[EVERY[:, 1] == ORDERS - 1][: len(new)]).sum(axis=1)
     assert distance.max() < 0.15
