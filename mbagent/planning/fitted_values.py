@@ -10,13 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csr_array
 
 from mbagent.models.base import Actions, States, TransitionModel
 from mbagent.models.state_graph import GraphArrays, StateGraph
 from mbagent.planning.goal import Goal
 from mbagent.planning.leaf_values import LOWEST_KNOWN, Floats, Indices, LeafValues, evaluate
+from mbagent.planning.pair_regression import PairRegression
 from mbagent.planning.value_iteration import bellman, score_edges
 from mbagent_envs._compiled import compiled
 from mbagent_envs.random_keys import derive
@@ -51,9 +50,6 @@ SWEEPS = 150
 SETTLED = 1e-4
 """They end when no value moves by more than this share of the largest reward."""
 
-RIDGE = 0.1
-"""Strength of the pull towards equal weights, in states."""
-
 _PLAY_SALT, _EXPAND_SALT, _SAMPLE_SALT = 0xF1A1, 0xF1A2, 0xF1A3
 
 
@@ -76,69 +72,10 @@ class Task:
     seed: int
 
 
-class _Columns:
-    """The sums of weights of many states, over and over: only what differs from each factor's commonest value is looked up.
-
-    Args:
-        states: int64 [N, F].
-        first: where each factor's weights begin, int64 [F].
-        size: number of weights, with the one for all states.
-    """
-
-    def __init__(self, states: States, first: Indices, size: int) -> None:
-        self._common = first + np.array([np.bincount(column).argmax() for column in states.T], dtype=np.int64)
-        columns = first + states
-        rows, factors = np.nonzero(columns != self._common)
-        ones = np.ones(len(rows))
-        where = np.concatenate([rows, rows]), np.concatenate([columns[rows, factors], self._common[factors]])
-        self._differences = csr_array((np.concatenate([ones, -ones]), where), shape=(len(states), size))
-
-    def values(self, leaf: LeafValues) -> Floats:
-        """What the states are worth, [N]; see ``leaf_value``."""
-        sums = leaf.weights[-1] + leaf.weights[self._common].sum() + self._differences @ leaf.weights
-        values: Floats = np.clip(sums, leaf.low, leaf.high)
-        return values
-
-
 @compiled
 def _back_up(graph: GraphArrays, rewards: Floats, gamma: float, nodes: Indices, v: Floats, q: Floats, out: Floats) -> None:
     for i in range(len(nodes)):
         out[i] = bellman(nodes[i], graph, rewards, gamma, v, q)
-
-
-class _Regression:
-    """Ridge regression of values on the one-hot values of factors, for many targets on the same states.
-
-    Args:
-        states: int64 [N, F].
-        cardinalities: of the factors.
-
-    Attributes:
-        first: where each factor's weights begin, int64 [F].
-        size: number of weights, with the one for all states.
-    """
-
-    def __init__(self, states: States, cardinalities: tuple[int, ...]) -> None:
-        counts = np.asarray(cardinalities)
-        self.first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64)
-        columns = np.zeros((len(states), int(counts.sum())))
-        columns[np.arange(len(states))[:, None], self.first + states] = 1.0
-        self._used = np.flatnonzero(columns.min(axis=0) < columns.max(axis=0))
-        self._mean = columns[:, self._used].mean(axis=0)
-        self._centred = columns[:, self._used] - self._mean
-        self.size = columns.shape[1] + 1
-        wide = len(self._used) > len(states)
-        x = self._centred if not wide else self._centred.T
-        self._factor, self._wide = cho_factor(x.T @ x + RIDGE * np.eye(x.shape[1])), wide
-
-    def fit(self, values: Floats) -> Floats:
-        """Weights [sum of cardinalities + 1] for values [N] of the states."""
-        mean, x = values.mean(), self._centred
-        found = x.T @ cho_solve(self._factor, values - mean) if self._wide else cho_solve(self._factor, x.T @ (values - mean))
-        weights = np.zeros(self.size)
-        weights[self._used] = found
-        weights[-1] = mean - float(found @ self._mean)
-        return weights
 
 
 def learn_values(task: Task) -> tuple[LeafValues, States]:
@@ -164,7 +101,7 @@ def _play(task: Task, leaf: LeafValues, number: int) -> States:
     for step in range(STEPS):
         met.append(states)
         actions = rng.integers(task.model.n_actions, size=PLAYERS)
-        if len(leaf.weights):
+        if len(leaf.common):
             by_chance = rng.random(PLAYERS) < CHANCE
             actions = np.where(by_chance, actions, greedy_actions(task, leaf, states, number * STEPS + step))
         keys = derive(task.seed, _SAMPLE_SALT, number * STEPS + step, np.arange(PLAYERS))
@@ -202,13 +139,13 @@ def _fit(task: Task, states: States, leaf: LeafValues, number: int) -> LeafValue
     nodes, v, found, q, rewards = _expanded(task, graph, leaf, (ROUNDS + number) * STEPS)
     if rewards.min() == rewards.max():
         return LOWEST_KNOWN
-    regression = _Regression(graph.states[nodes], task.model.cardinalities)
     low, high = (float(end) / (1.0 - task.gamma) for end in (min(rewards.min(), 0.0), max(rewards.max(), 0.0)))
-    columns, moved = _Columns(graph.states, regression.first, regression.size), SETTLED * float(np.abs(rewards).max())
+    regression = PairRegression(graph.states[nodes], task.model.cardinalities, graph.states, low, high)
+    moved = SETTLED * float(np.abs(rewards).max())
     for _ in range(SWEEPS):
         _back_up(graph.arrays, rewards, task.gamma, nodes, v, q, found)
-        leaf, before = LeafValues(regression.fit(found), regression.first, low, high), v
-        v = columns.values(leaf)
+        leaf, before = regression.fit(found), v
+        v = regression.values(leaf)
         if np.abs(v - before).max() <= moved:
             break
-    return leaf if np.isfinite(leaf.weights).all() else LOWEST_KNOWN
+    return leaf if np.isfinite(leaf.mean) and np.isfinite(leaf.weights).all() else LOWEST_KNOWN

@@ -146,7 +146,7 @@ class MachinePlanner:
         settings = self.settings
         self._way = None  # should the goal fail now, it is tried again
         leaf, met = learn_values(task)
-        if len(leaf.weights) == 0:
+        if len(leaf.common) == 0:
             return usual
 
         def act(way: Way, states: States) -> Actions:

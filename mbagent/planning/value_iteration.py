@@ -152,7 +152,7 @@ def sweep(
             moved[g] = max(moved[g], abs(best - v[s]))
             v[s] = best
             lows[g] = min(lows[g], best)
-        if len(leaf.weights) == 0:
+        if len(leaf.common) == 0:
             _set_frontier(graph, active, lows, moved, v, frontier)
         active &= moved > tolerance * scale
         if not active.any():

@@ -159,7 +159,7 @@ def end_wave(
     n, m = graph.sizes[0], graph.sizes[1]
     v, q, rewards = tables.v[:n], tables.q[:n], tables.rewards[:m]
     for node in range(n_before, n):
-        known = len(tables.leaf.weights) > 0
+        known = len(tables.leaf.common) > 0
         v[node] = leaf_value(tables.leaf, graph.states[node]) if known else tables.frontier[graph.groups[node]]
         q[node], tables.visits[node], tables.counted[node] = 0.0, 0.0, 0.0
     if not rules.rollouts:
