@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mbagent.models.graphs.habits import Habit
 from mbagent.models.graphs.leaves import LeafPrior, fitted_prior
+from mbagent.models.graphs.partners import chained
 from mbagent.models.graphs.search import Search
 from mbagent.models.graphs.units import BEYOND, Layout, Question
 from mbagent_envs._compiled import compiled
@@ -112,9 +113,15 @@ def build(layout: Layout, asked: Sequence[Question], found: Sequence[Search], ha
     nodes, prior = Nodes(), fitted_prior(found)
     pairs = np.concatenate([[0], np.cumsum(layout.acts.n_ways * layout.outputs)]).astype(np.int64)
     entries = [np.zeros((0, 3), dtype=np.int64)]
+    partnered: dict[int, list[tuple[Question, Ints]]] = {}
     for question, search in zip(asked, found, strict=True):
         first = nodes.graph(search, prior)[question.context]
-        entries.append(np.stack([pairs[question.unit] + question.pairs, question.values, first], axis=1))
+        if question.partner is not None:
+            partnered.setdefault(question.unit, []).append((question, first))
+        else:
+            entries.append(np.stack([pairs[question.unit] + question.pairs, question.values, first], axis=1))
+    for unit, answered in partnered.items():
+        entries += _by_partner(nodes, answered, pairs[unit], int(layout.outputs[unit]), layout.acts.n_ways)
     rates = np.asarray(nodes.rates, dtype=np.float64).reshape(-1, 2)
     return Graphs(
         np.asarray(sorted({question.unit for question in asked}), dtype=np.int64),
@@ -128,6 +135,15 @@ def build(layout: Layout, asked: Sequence[Question], found: Sequence[Search], ha
         np.concatenate([habit.base for habit in habits]),
         np.asarray([still]),
     )
+
+
+def _by_partner(nodes: Nodes, answered: Sequence[tuple[Question, Ints]], begin: int, cardinality: int, n_ways: int) -> list[Ints]:
+    """Entries (pair, value, node) [N, 3] of a unit that has a partner: what the action is, nodes ask for if at all."""
+    rows = [np.stack([*np.divmod(q.pairs, cardinality), q.values, first], axis=1) for q, first in answered]
+    columns = answered[0][0].partner
+    assert columns is not None
+    now, value, node = chained(np.concatenate(rows), columns, nodes.add, nodes.add(-1, 0, 0)).T
+    return [np.stack([begin + way * cardinality + now, value, node], axis=1) for way in range(n_ways)]
 
 
 @compiled

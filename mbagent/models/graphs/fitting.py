@@ -16,7 +16,8 @@ from mbagent.models.graphs.compiled import Graphs, build
 from mbagent.models.graphs.conditioner import find_dependent, uncertain_rows
 from mbagent.models.graphs.exclusive import find_cliques, find_groups
 from mbagent.models.graphs.greedy import find_splits
-from mbagent.models.graphs.manners import Manner, ask_in, habit_in
+from mbagent.models.graphs.manners import WHERE, Asking, ask_in, habit_in
+from mbagent.models.graphs.partners import for_all_ways
 from mbagent.models.graphs.search import Search
 from mbagent.models.graphs.units import (
     Layout,
@@ -36,7 +37,7 @@ from mbagent.transitions import TransitionBatch
 Bools: TypeAlias = NDArray[np.bool_]
 Ints: TypeAlias = NDArray[np.int64]
 
-NO_MANNERS: Mapping[int, Manner] = MappingProxyType({})
+NO_MANNERS: Mapping[int, Asking] = MappingProxyType({})
 """All factors are asked where they go."""
 
 SOME_ROWS = 4000
@@ -77,7 +78,7 @@ class _Table:
     """
 
     def __init__(
-        self, layout: Layout, rows: TransitionBatch, events: Bools, manners: Mapping[int, Manner], since: Ints | None
+        self, layout: Layout, rows: TransitionBatch, events: Bools, manners: Mapping[int, Asking], since: Ints | None
     ) -> None:
         """See the class."""
         self.layout, self.rows = layout, rows
@@ -87,7 +88,7 @@ class _Table:
             self.since[:-2] = [since[factors].max() for factors in members[:-2]]
             self.since[-2] = since[-1]
         lone = np.flatnonzero(np.diff(layout.first) == 1)
-        self.manners = {int(unit): manners.get(int(layout.members[layout.first[unit]]), Manner.GOES) for unit in lone}
+        self.manners = {int(unit): manners.get(int(layout.members[layout.first[unit]]), WHERE) for unit in lone}
         flags = np.stack([rows.terminated, events], axis=1).astype(np.uint8)
         self.now = np.concatenate([unit_values(layout, rows.before), np.zeros_like(flags)], axis=1)
         self.then = np.concatenate([unit_values(layout, rows.after), flags], axis=1)
@@ -105,13 +106,17 @@ class _Table:
 
     def questions(self, unit: int, seen: Seen) -> list[Question]:
         """The questions about a unit, of rows with whatever looks."""
-        manner, n_ways = self.manners.get(unit, Manner.GOES), self.layout.acts.n_ways
-        return ask_in(manner, unit, int(self.layout.outputs[unit]), n_ways, seen)
+        manner, partner = self.manners.get(unit, WHERE)
+        n_ways = self.layout.acts.n_ways if partner is None else partner.cardinality
+        asked = ask_in(manner, unit, int(self.layout.outputs[unit]), n_ways, seen)
+        return asked if partner is None else [replace(one, partner=partner.columns(self.layout)) for one in asked]
 
     def seen(self, unit: int) -> Seen:
-        """A unit's values in all rows."""
+        """A unit's values in all rows, with the action or what takes its place."""
         now, then = (values[:, unit].astype(np.int64) for values in (self.now, self.then))
-        return Seen(self.pattern, self.layout.acts.way[self.rows.actions], now, then)
+        partner = self.manners.get(unit, WHERE).partner
+        ways = self.layout.acts.way[self.rows.actions] if partner is None else partner.of(self.rows)
+        return Seen(self.pattern, ways, now, then)
 
     def kinds(self, seen: Ints) -> Ints:
         """Kind of each column, by some rows."""
@@ -120,10 +125,11 @@ class _Table:
 
     def build(self, asked: Sequence[Question], found: Sequence[Search], seen: Ints, still: float) -> Graphs:
         """The graphs; habits are those of the rows seen."""
-        habits = []
+        habits, n_ways = [], self.layout.acts.n_ways
         for unit, cardinality in enumerate(self.layout.outputs):
-            some = self.seen(unit).select(self.counting(unit, seen))
-            habits.append(habit_in(self.manners.get(unit, Manner.GOES), int(cardinality), self.layout.acts.n_ways, some))
+            some, (manner, partner) = self.seen(unit).select(self.counting(unit, seen)), self.manners.get(unit, WHERE)
+            habit = habit_in(manner, int(cardinality), n_ways if partner is None else partner.cardinality, some)
+            habits.append(habit if partner is None else for_all_ways(habit, partner.cardinality, n_ways))
         return build(self.layout, asked, found, habits, still)
 
 
@@ -139,7 +145,7 @@ def fit_graphs(
     events: Bools,
     in_pairs: bool = True,
     jointly: bool = True,
-    manners: Mapping[int, Manner] = NO_MANNERS,
+    manners: Mapping[int, Asking] = NO_MANNERS,
     since: Ints | None = None,
 ) -> Fitted:
     """Fits everything.

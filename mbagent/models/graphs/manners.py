@@ -6,16 +6,17 @@ sum: what luck takes is asked of all stocks and orders at once, and at either bo
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import Enum
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.base import Bools, Floats
 from mbagent.models.graphs.habits import Habit, Pools, habit_of
+from mbagent.models.graphs.partners import Partner
 from mbagent.models.graphs.units import Question, Seen, ask, question
 from mbagent.models.memory import FORETOLD, better
 from mbagent.transitions import TransitionBatch
@@ -28,7 +29,7 @@ SELDOM = 1e-9
 
 
 class Manner(Enum):
-    """How a factor is asked about; a sum or a difference is that of its value and the action's number.
+    """How a factor is asked about; a sum or a difference is that of its value and the action's number, or its partner's value.
 
     What is beyond the bounds counts in some sums, and is lost before luck comes in others: those fill or drain.
     """
@@ -46,6 +47,16 @@ class Manner(Enum):
         return np.clip(sums, 0, last) if self in (Manner.FILLS, Manner.DRAINS) else sums
 
 
+class Asking(NamedTuple):
+    """A manner, and what sums are with; None for the action's number."""
+
+    manner: Manner
+    partner: Partner | None = None
+
+
+WHERE = Asking(Manner.GOES)
+"""Where it goes."""
+
 SUMS = (Manner.ADDS, Manner.TAKES, Manner.FILLS, Manner.DRAINS)
 """Manners that ask of sums."""
 
@@ -56,26 +67,42 @@ ENOUGH, MOST_FOLDS = 500, 6
 """So many held-out rows tell which manner fits; where there are fewer, others are held out, too, so many times in all."""
 
 
-def best_manners(foretold: Callable[[Manner], Floats], n_actions: int) -> list[Manner]:
-    """The manner in which each of K factors is foretold best.
+def best_askings(
+    foretold: Callable[[Sequence[Asking]], Floats],
+    n_factors: int,
+    n_actions: int,
+    partners: Callable[[], Sequence[tuple[Partner, int] | None]],
+) -> list[Asking]:
+    """How each of K factors is foretold best.
 
-    Sums are looked at where something is left to foretell, and there are actions enough to tell a sum from two kinds of moves.
+    Sums are looked at where something is left to foretell: with the action's number if there are actions enough to tell a sum
+    from two kinds of moves, and with a likely partner.
 
     Args:
-        foretold: log-probabilities of held-out next values where all are asked about in some manner, [N, K].
+        foretold: log-probabilities of held-out next values, each factor being asked about in some way, [N, K].
+        n_factors: K.
         n_actions: number of ways of actions.
+        partners: the likeliest of each factor, and whether it is added (1) or taken away (-1).
     """
-    logs, moves = foretold(Manner.GOES), foretold(Manner.MOVES)
+    logs, moves = (foretold([asking] * n_factors) for asking in (WHERE, Asking(Manner.MOVES)))
     moving = (moves - logs).sum(axis=0) > 0.0
-    best, logs = [Manner.MOVES if there else Manner.GOES for there in moving], np.where(moving, moves, logs)
-    random = np.flatnonzero(logs.mean(axis=0) < FORETOLD)
-    if not len(random) or n_actions < 3:
+    best, logs = [Asking(Manner.MOVES) if there else WHERE for there in moving], np.where(moving, moves, logs)
+    random = np.flatnonzero(logs.mean(axis=0) < FORETOLD).tolist()
+    if not random:
         return best
-    sums = np.stack([foretold(manner) for manner in SUMS])
+    rounds = [[Asking(manner)] * n_factors for manner in SUMS] if n_actions > 2 else []
+    likely = partners()
+    if any(likely[i] for i in random):
+        for up, down in ((Manner.ADDS, Manner.TAKES), (Manner.FILLS, Manner.DRAINS)):
+            with_partner = [one and Asking(up if one[1] > 0 else down, one[0]) for one in likely]
+            rounds.append([asked or usual for asked, usual in zip(with_partner, best, strict=True)])
+    if not rounds:
+        return best
+    sums = np.stack([foretold(askings) for askings in rounds])
     for i in random:
         most = int(sums[:, :, i].mean(axis=1).argmax())
         if better(sums[most, :, i], logs[:, i], SUM_ERRORS):
-            best[i] = SUMS[most]
+            best[i] = rounds[most][i]
     return best
 
 

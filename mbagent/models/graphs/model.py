@@ -21,8 +21,9 @@ from mbagent.models.graphs.events import flag_events
 from mbagent.models.graphs.exclusive import find_groups
 from mbagent.models.graphs.fitting import Fitted, fit_graphs, nothing_late
 from mbagent.models.graphs.habits import habit_of
-from mbagent.models.graphs.manners import Manner, best_manners, more_folds
+from mbagent.models.graphs.manners import Asking, best_askings, more_folds
 from mbagent.models.graphs.parents import flat_variables
+from mbagent.models.graphs.partners import Partner, candidates, likely_partners
 from mbagent.models.graphs.predictions import GraphPredictions
 from mbagent.models.graphs.recency import still_true_since
 from mbagent.models.graphs.units import coupled_layout, is_lone_bit, lay_out
@@ -246,29 +247,31 @@ class DecisionGraphModel(GraphPredictions):
                 break
         return events & (gain > 0.0)
 
-    def _manners(self, train: TransitionBatch, events: Bools, held_out: TransitionBatch) -> dict[int, Manner]:
-        """How each factor is asked about: in the manner by which its held-out values are foretold best."""
+    def _manners(self, train: TransitionBatch, events: Bools, held_out: TransitionBatch) -> dict[int, Asking]:
+        """How each factor is asked about: as its held-out values are foretold best."""
         n_contexts, n_columns = self.acts.n_ways * max(self.cardinalities, default=0), 2 * sum(self.cardinalities)
         every = [f for f, cardinality in enumerate(self.cardinalities) if cardinality > 2]
         if not every or n_contexts * n_columns > MOST_COUNTS or len(held_out) == 0:
             return {}
-        folds = [
-            (train, events, held_out),
-            *((train.select(~out), events[~out], train.select(out)) for out in more_folds(train, held_out)),
-        ]
+        folds = [(train, events, held_out)]
+        folds += [(train.select(~out), events[~out], train.select(out)) for out in more_folds(train, held_out)]
 
-        def foretold(manner: Manner) -> Floats:
-            return np.concatenate([self._foretold_in(manner, every, *fold) for fold in folds])
+        def foretold(askings: Sequence[Asking]) -> Floats:
+            named = dict(zip(every, askings, strict=True))
+            return np.concatenate([self._foretold_in(named, *fold) for fold in folds])
 
-        return dict(zip(every, best_manners(foretold, self.acts.n_ways), strict=True))
+        def partners() -> Sequence[tuple[Partner, int] | None]:
+            return likely_partners(every, candidates(self.cardinalities, self.parts), train.select(~events))
+
+        return dict(zip(every, best_askings(foretold, len(every), self.acts.n_ways, partners), strict=True))
 
     def _foretold_in(
-        self, manner: Manner, factors: list[int], train: TransitionBatch, events: Bools, held_out: TransitionBatch
+        self, askings: Mapping[int, Asking], train: TransitionBatch, events: Bools, held_out: TransitionBatch
     ) -> Floats:
-        """Log-probability of each factor's held-out next value, [N, K], all being asked about in one manner."""
-        self.fitted = fit_graphs(self.cardinalities, self.acts, train, events, False, False, dict.fromkeys(factors, manner))
+        """Log-probability of the held-out next values of K factors, [N, K], that are asked about so."""
+        self.fitted = fit_graphs(self.cardinalities, self.acts, train, events, False, False, askings)
         start = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64)
-        probs = self.marginals(held_out.states, held_out.actions)
+        probs, factors = self.marginals(held_out.states, held_out.actions), list(askings)
         chosen = np.take_along_axis(probs, start[factors] + held_out.after[:, factors], axis=1)
         logs: Floats = np.log(chosen.clip(1e-9))
         return logs

@@ -207,6 +207,7 @@ class Question:
         pairs: action times cardinality plus present value, of each pair that has an answer, int64 [P], ascending.
         head: the rows.
         context: the context of each pair, int64 [P]; unless several pairs are one context from the start, each is its own.
+        partner: columns of what takes the action's place in the pairs, one for each of its values, int64; None for the action.
     """
 
     unit: int
@@ -214,6 +215,7 @@ class Question:
     pairs: Ints
     head: Head
     context: Ints
+    partner: Ints | None = None
 
 
 @dataclass(frozen=True)
