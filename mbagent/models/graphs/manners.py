@@ -29,7 +29,7 @@ SELDOM = 1e-9
 
 
 class Manner(Enum):
-    """How a factor is asked about; a sum or a difference is that of its value and the action's number, or its partner's value.
+    """How a factor is asked about; a sum or a difference is that of its value and the action's number, or its partner's.
 
     What is beyond the bounds counts in some sums, and is lost before luck comes in others: those fill or drain.
     """
@@ -48,7 +48,7 @@ class Manner(Enum):
 
 
 class Asking(NamedTuple):
-    """A manner, and what sums are with; None for the action's number."""
+    """A manner, and what sums are with; None for the number of the action's way."""
 
     manner: Manner
     partner: Partner | None = None
@@ -70,40 +70,40 @@ ENOUGH, MOST_FOLDS = 500, 6
 def best_askings(
     foretold: Callable[[Sequence[Asking]], Floats],
     n_factors: int,
-    n_actions: int,
+    n_ways: int,
     partners: Callable[[], Sequence[tuple[Partner, int] | None]],
 ) -> list[Asking]:
-    """How each of K factors is foretold best.
-
-    Sums are looked at where something is left to foretell: with the action's number if there are actions enough to tell a sum
-    from two kinds of moves, and with a likely partner.
+    """How each of K factors is foretold best; sums are looked at where something is left to foretell.
 
     Args:
         foretold: log-probabilities of held-out next values, each factor being asked about in some way, [N, K].
         n_factors: K.
-        n_actions: number of ways of actions.
+        n_ways: number of ways of actions.
         partners: the likeliest of each factor, and whether it is added (1) or taken away (-1).
     """
     logs, moves = (foretold([asking] * n_factors) for asking in (WHERE, Asking(Manner.MOVES)))
     moving = (moves - logs).sum(axis=0) > 0.0
     best, logs = [Asking(Manner.MOVES) if there else WHERE for there in moving], np.where(moving, moves, logs)
     random = np.flatnonzero(logs.mean(axis=0) < FORETOLD).tolist()
-    if not random:
+    likely = partners() if random else []
+    if not any(likely[i] for i in random):
         return best
-    rounds = [[Asking(manner)] * n_factors for manner in SUMS] if n_actions > 2 else []
-    likely = partners()
-    if any(likely[i] for i in random):
-        for up, down in ((Manner.ADDS, Manner.TAKES), (Manner.FILLS, Manner.DRAINS)):
-            with_partner = [one and Asking(up if one[1] > 0 else down, one[0]) for one in likely]
-            rounds.append([asked or usual for asked, usual in zip(with_partner, best, strict=True)])
-    if not rounds:
-        return best
+    rounds = [
+        [_summed(manners, one, n_ways) if one else usual for one, usual in zip(likely, best, strict=True)]
+        for manners in ((Manner.ADDS, Manner.TAKES), (Manner.FILLS, Manner.DRAINS))
+    ]
     sums = np.stack([foretold(askings) for askings in rounds])
     for i in random:
         most = int(sums[:, :, i].mean(axis=1).argmax())
         if better(sums[most, :, i], logs[:, i], SUM_ERRORS):
             best[i] = rounds[most][i]
     return best
+
+
+def _summed(manners: tuple[Manner, Manner], likely: tuple[Partner, int], n_ways: int) -> Asking:
+    """How to ask about a sum with a partner, or a difference; ways that are actions need none."""
+    partner, sign = likely
+    return Asking(manners[sign < 0], None if partner.factor < 0 and partner.cardinality == n_ways else partner)
 
 
 def more_folds(train: TransitionBatch, held_out: TransitionBatch) -> list[Bools]:

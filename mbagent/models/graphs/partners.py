@@ -1,6 +1,6 @@
-"""What a factor's value is summed with, where that is not the action's number: a part of the action, or another factor.
+"""What a factor's value is summed with: the action's number, that of a part of the action, or another factor's value.
 
-Stock plus what arrives today minus demand, where what arrives was ordered before; two products with an order each.
+Stock plus order minus demand; two products with an order each; stock plus what arrives today, which was ordered before.
 """
 
 from __future__ import annotations
@@ -29,15 +29,18 @@ MOST_LOOKED_AT = 5000
 MOST_CANDIDATES = 200
 """Ordered factors and parts of actions; where there are more, no partners are looked for."""
 
+MOST_PAIRS = 100_000
+"""Pairs of a factor's and its partner's values."""
+
 
 @dataclass(frozen=True)
 class Partner:
-    """A factor, or a part of the action.
+    """A factor, the action, or a part of it.
 
     Attributes:
         cardinality: number of its values.
-        factor: number of the factor, or -1 for a part of the action.
-        stride: of the part: it is ``action // stride % cardinality``.
+        factor: number of the factor, or -1.
+        stride: of the action's part: it is ``action // stride % cardinality``.
         column: number of the part's first column among those of actions.
     """
 
@@ -60,9 +63,9 @@ class Partner:
 
 
 def candidates(cardinalities: Sequence[int], parts: Sequence[int]) -> list[Partner]:
-    """All factors with an order, and all parts of an action of several that have one; what is on or off has none."""
+    """All factors with an order, and all parts of the action that have one; what is on or off has none."""
     factors = [Partner(n, factor=f) for f, n in enumerate(cardinalities) if n > 2]
-    columns = enumerate(act_columns(parts) if len(parts) > 1 else ())
+    columns = enumerate(act_columns(parts))
     return factors + [Partner(n, -1, stride, i) for i, (stride, n, value) in columns if n > 2 and value == 0]
 
 
@@ -88,8 +91,10 @@ def likely_partners(factors: Sequence[int], among: Sequence[Partner], rows: Tran
     left = ((change - x @ slopes) ** 2).sum(axis=0) / (len(some) - len(among) - 1)
     t = slopes / np.sqrt(np.outer(np.diag(inverse), left) + 1e-12)
     found: list[tuple[Partner, int] | None] = []
+    sizes = np.asarray([partner.cardinality for partner in among])
     for i, factor in enumerate(factors):
-        t[[partner.factor == factor for partner in among], i] = 0.0
+        own = [partner.factor == factor for partner in among]
+        t[own | (sizes * sizes[own] > MOST_PAIRS), i] = 0.0
         best = int(np.abs(t[:, i]).argmax())
         found.append((among[best], int(np.sign(t[best, i]))) if abs(t[best, i]) > SURE else None)
     return found

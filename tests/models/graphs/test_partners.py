@@ -88,6 +88,8 @@ def test_the_likeliest_partner_is_the_one_that_is_added() -> None:
     parts = (ORDERS, 2, ORDERS)
     every = candidates((LAST + 1, 2, 4), parts)
     assert every == [Partner(LAST + 1, 0), Partner(4, 2), Partner(ORDERS, -1, 12, 0), Partner(ORDERS, -1, 1, 7)]
+    assert candidates((2,), (5,)) == [Partner(5)]
+    assert candidates((2,), (2,)) == candidates((2, 2), (2, 2)) == []
     rng, n = np.random.default_rng(0), 400
     states, actions = rng.integers([LAST + 1, 2, 4], size=(n, 3)), rng.integers(72, size=n)
     following = states.copy()
