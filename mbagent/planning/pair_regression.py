@@ -29,7 +29,7 @@ class PairRegression:
     The kernel of two states that share d columns is d + PAIRED d (d - 1) / 2, which counts every pair of columns as one more.
 
     Args:
-        states: int64 [N, F], whose values are given.
+        states: int64 [N, F], whose values are given, one at least.
         cardinalities: of the factors.
         valued: int64 [M, F], whose values are asked for.
         low, high: bounds of values.

@@ -60,17 +60,16 @@ WHERE = Asking(Manner.GOES)
 SUMS = (Manner.ADDS, Manner.TAKES, Manner.FILLS, Manner.DRAINS)
 """Manners that ask of sums."""
 
-SUM_ERRORS = 2.0
+SUM_ERRORS = 1.0
 """Standard errors by which a sum must foretell held-out values better: what an action's number is may mean nothing."""
 
-ENOUGH, MOST_FOLDS = 500, 6
+ENOUGH, MOST_FOLDS = 1000, 6
 """So many held-out rows tell which manner fits; where there are fewer, others are held out, too, so many times in all."""
 
 
 def best_askings(
     foretold: Callable[[Sequence[Asking]], Floats],
     n_factors: int,
-    n_ways: int,
     partners: Callable[[], Sequence[tuple[Partner, int] | None]],
 ) -> list[Asking]:
     """How each of K factors is foretold best; sums are looked at where something is left to foretell.
@@ -78,7 +77,6 @@ def best_askings(
     Args:
         foretold: log-probabilities of held-out next values, each factor being asked about in some way, [N, K].
         n_factors: K.
-        n_ways: number of ways of actions.
         partners: the likeliest of each factor, and whether it is added (1) or taken away (-1).
     """
     logs, moves = (foretold([asking] * n_factors) for asking in (WHERE, Asking(Manner.MOVES)))
@@ -89,7 +87,7 @@ def best_askings(
     if not any(likely[i] for i in random):
         return best
     rounds = [
-        [_summed(manners, one, n_ways) if one else usual for one, usual in zip(likely, best, strict=True)]
+        [_summed(manners, *one) if one else usual for one, usual in zip(likely, best, strict=True)]
         for manners in ((Manner.ADDS, Manner.TAKES), (Manner.FILLS, Manner.DRAINS))
     ]
     sums = np.stack([foretold(askings) for askings in rounds])
@@ -100,10 +98,9 @@ def best_askings(
     return best
 
 
-def _summed(manners: tuple[Manner, Manner], likely: tuple[Partner, int], n_ways: int) -> Asking:
-    """How to ask about a sum with a partner, or a difference; ways that are actions need none."""
-    partner, sign = likely
-    return Asking(manners[sign < 0], None if partner.factor < 0 and partner.cardinality == n_ways else partner)
+def _summed(manners: tuple[Manner, Manner], partner: Partner, sign: int) -> Asking:
+    """How to ask about a sum with a partner, or a difference; actions are in all questions as it is."""
+    return Asking(manners[sign < 0], None if partner.whole else partner)
 
 
 def more_folds(train: TransitionBatch, held_out: TransitionBatch) -> list[Bools]:

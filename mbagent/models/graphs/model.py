@@ -263,7 +263,7 @@ class DecisionGraphModel(GraphPredictions):
         def partners() -> Sequence[tuple[Partner, int] | None]:
             return likely_partners(every, candidates(self.cardinalities, self.parts), train.select(~events))
 
-        return dict(zip(every, best_askings(foretold, len(every), self.acts.n_ways, partners), strict=True))
+        return dict(zip(every, best_askings(foretold, len(every), partners), strict=True))
 
     def _foretold_in(
         self, askings: Mapping[int, Asking], train: TransitionBatch, events: Bools, held_out: TransitionBatch

@@ -29,8 +29,8 @@ MOST_LOOKED_AT = 5000
 MOST_CANDIDATES = 200
 """Ordered factors and parts of actions; where there are more, no partners are looked for."""
 
-MOST_PAIRS = 100_000
-"""Pairs of a factor's and its partner's values."""
+MOST_ENTRIES = 50_000
+"""Nodes that a sum with a partner may take: its values times the factor's, times how many steps from the sum that ends."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,14 @@ class Partner:
         factor: number of the factor, or -1.
         stride: of the action's part: it is ``action // stride % cardinality``.
         column: number of the part's first column among those of actions.
+        whole: whether it is the action, which is one thing.
     """
 
     cardinality: int
     factor: int = -1
     stride: int = 1
     column: int = 0
+    whole: bool = False
 
     def of(self, rows: TransitionBatch) -> Ints:
         """Its value in each row, int64 [N]."""
@@ -66,7 +68,7 @@ def candidates(cardinalities: Sequence[int], parts: Sequence[int]) -> list[Partn
     """All factors with an order, and all parts of the action that have one; what is on or off has none."""
     factors = [Partner(n, factor=f) for f, n in enumerate(cardinalities) if n > 2]
     columns = enumerate(act_columns(parts))
-    return factors + [Partner(n, -1, stride, i) for i, (stride, n, value) in columns if n > 2 and value == 0]
+    return factors + [Partner(n, -1, stride, i, len(parts) == 1) for i, (stride, n, value) in columns if n > 2 and value == 0]
 
 
 def likely_partners(factors: Sequence[int], among: Sequence[Partner], rows: TransitionBatch) -> list[tuple[Partner, int] | None]:
@@ -91,13 +93,19 @@ def likely_partners(factors: Sequence[int], among: Sequence[Partner], rows: Tran
     left = ((change - x @ slopes) ** 2).sum(axis=0) / (len(some) - len(among) - 1)
     t = slopes / np.sqrt(np.outer(np.diag(inverse), left) + 1e-12)
     found: list[tuple[Partner, int] | None] = []
-    sizes = np.asarray([partner.cardinality for partner in among])
     for i, factor in enumerate(factors):
         own = [partner.factor == factor for partner in among]
-        t[own | (sizes * sizes[own] > MOST_PAIRS), i] = 0.0
+        t[own, i] = 0.0
         best = int(np.abs(t[:, i]).argmax())
-        found.append((among[best], int(np.sign(t[best, i]))) if abs(t[best, i]) > SURE else None)
+        likely = (among[best], int(np.sign(t[best, i]))) if abs(t[best, i]) > SURE else None
+        found.append(likely if likely and _entries(*likely, among[own.index(True)], some) <= MOST_ENTRIES else None)
     return found
+
+
+def _entries(partner: Partner, sign: int, factor: Partner, rows: TransitionBatch) -> int:
+    """Number of nodes that a factor's sum with its partner takes, at most; with the action none."""
+    far = rows.after[:, factor.factor].astype(np.int64) - factor.of(rows) - sign * partner.of(rows)
+    return factor.cardinality * partner.cardinality * (len(np.unique(far)) + 2) * (not partner.whole)
 
 
 def chained(entries: Ints, columns: Ints, add: Callable[[int, int, int], int], zero: int) -> Ints:

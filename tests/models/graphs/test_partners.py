@@ -84,11 +84,36 @@ def test_what_was_ordered_before_arrives() -> None:
     assert 0.5 * np.abs(listed - probs[:, : LAST + 1]).sum(axis=1).max() < 0.05
 
 
+def test_a_sum_is_not_passed_over_where_much_is_known() -> None:
+    rng, n = np.random.default_rng(3), 5000
+    states, actions = rng.integers([10, 5], size=(n, 2)), rng.integers(2, size=n)
+    left = np.clip(states[:, 0] + states[:, 1] - rng.integers(5, size=n), 0, 9)
+    model = DecisionGraphModel((10, 5), 2)
+    model.fit(dataset((10, 5), 2, states, actions, np.column_stack([left, rng.integers(5, size=n)])))
+    every = np.array(list(np.ndindex(10, 5)))
+    expected = np.zeros((50, 10))
+    for luck in range(5):
+        expected[np.arange(50), np.clip(every.sum(axis=1) - luck, 0, 9)] += 0.2
+    found = model.marginals(every, np.zeros(50, dtype=np.int64))[:, :10]
+    assert 0.5 * np.abs(found - expected).sum(axis=1).max() < 0.08  # by moves 0.2
+
+
+def test_sums_that_would_take_too_much_are_left_alone() -> None:
+    rng, n = np.random.default_rng(0), 400
+    states = rng.integers(100, size=(n, 2))
+    following = states.copy()
+    following[:, 0] = np.clip(states.sum(axis=1) - rng.integers(50, size=n), 0, 99)
+    found = rows(states, np.zeros(n, dtype=np.int64), following)
+    assert likely_partners((0,), candidates((100, 100), (1,)), found) == [None]
+    small = rows(states // 10, np.zeros(n, dtype=np.int64), following // 10)
+    assert likely_partners((0,), candidates((10, 10), (1,)), small) == [(Partner(10, 1), 1)]
+
+
 def test_the_likeliest_partner_is_the_one_that_is_added() -> None:
     parts = (ORDERS, 2, ORDERS)
     every = candidates((LAST + 1, 2, 4), parts)
     assert every == [Partner(LAST + 1, 0), Partner(4, 2), Partner(ORDERS, -1, 12, 0), Partner(ORDERS, -1, 1, 7)]
-    assert candidates((2,), (5,)) == [Partner(5)]
+    assert candidates((2,), (5,)) == [Partner(5, whole=True)]
     assert candidates((2,), (2,)) == candidates((2, 2), (2, 2)) == []
     rng, n = np.random.default_rng(0), 400
     states, actions = rng.integers([LAST + 1, 2, 4], size=(n, 3)), rng.integers(72, size=n)
