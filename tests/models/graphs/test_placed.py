@@ -1,5 +1,7 @@
 """Planes whose rules hang on the place, and planes whose rules do not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -57,3 +59,18 @@ def test_rules_that_are_the_same_everywhere_stay_so() -> None:
     other.load_state_dict(model.state_dict())
     assert other.flat is None
     assert model.for_space(spaces.MultiBinary((11, 11))).cardinalities == (2,) * 121
+
+
+def test_places_are_known_as_they_are_now_where_rules_have_changed() -> None:
+    """Left and right changed places in every cell; what was before says the contrary."""
+    flip = np.random.default_rng(3).integers(2, size=(SIZE, SIZE))
+    space, data = walk(3000, flip)
+    new = walk(3000, 1 - flip, 1)[1].rows()
+    data.append(replace(new, episodes=new.episodes + 1000))
+    model = PlaneGraphModel(space, 2)
+    report = model.fit(data)
+    assert model.flat is not None
+    assert report.exact_match == 1.0
+    rows = walk(300, 1 - flip, 2)[1].rows()
+    found, _ = model.likeliest(rows.states, rows.actions)
+    np.testing.assert_array_equal(found, rows.after)
