@@ -105,7 +105,7 @@ class GraphPredictions(BaseTransitionModel):
         return self._draw(states, actions, np.zeros(len(states), dtype=np.uint64), greedy=True)
 
     def marginals(self, states: States, actions: Actions) -> Floats:
-        """See TransitionModel."""
+        """See TransitionModel; of a factor that is drawn after others, given what these become, as learned of it by itself."""
         states, actions = self._rows(states, actions)
         start = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64)
         fitted, probs = self.fitted, np.empty((len(states), int(start[-1])))
