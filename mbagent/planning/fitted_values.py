@@ -1,8 +1,8 @@
-"""Values learned in imagination, for worlds too large to solve: fitted value iteration with a weight for each factor's value.
+"""Values learned in imagination, for worlds too large to solve: fitted value iteration, with weights of pairs of factors' values.
 
 States are met by imagined play, at first at random and then by the values found so far; values are backed up through the
 model's successors and fitted by ridge regression, over and over (Gordon 1995; Guestrin, Koller, Parr and Venkataraman 2003
-for sums over factors). They hold for one goal and are forgotten with it.
+for sums over few factors each). They hold for one goal and are forgotten with it.
 """
 
 from __future__ import annotations

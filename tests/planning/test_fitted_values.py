@@ -52,7 +52,7 @@ def test_values_that_are_sums_over_factors_are_found() -> None:
     on = np.eye(9, 8, -1, dtype=np.int64)  # none, then each alone
     values = np.empty(9)
     evaluate(leaf, on, np.zeros(9, dtype=np.bool_), values)
-    np.testing.assert_allclose(values[1:] - values[0], 0.8 / (1 - 0.9 * 0.8), rtol=0.3)
+    np.testing.assert_allclose(values[1:] - values[0], 0.8 / (1 - 0.9 * 0.8), rtol=0.2)
 
 
 def test_behaviour_by_learned_values_looks_beyond_one_step() -> None:

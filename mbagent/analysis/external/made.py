@@ -20,14 +20,19 @@ Outcome = tuple[float, int, float, bool]
 class TableEnv(gym.Env[Any, Any]):
     """A world by its table.
 
-    Attributes:
-        P: outcomes of each action in each state, ``P[state][action]``.
-        initial_state_distrib: probability of each state that an episode begins there, float64 [S].
+    Args:
+        table: outcomes of each action in each state, ``table[state][action]``.
+        start: the state in which all episodes begin.
         observations: what is seen of each state, [S, ...].
+        space: of what is seen.
+
+    Attributes:
+        P: the table, as toy_text calls it.
+        initial_state_distrib: probability of each state that an episode begins there, float64 [S].
     """
 
     def __init__(self, table: list[list[list[Outcome]]], start: int, observations: NDArray[Any], space: gym.Space[Any]) -> None:
-        """Args: the table; the state in which all episodes begin; what is seen of each state, [S, ...], and its space."""
+        """See the class."""
         self.P, self.observations, self.state = table, observations, start
         self.initial_state_distrib = np.eye(len(table))[start]
         self.observation_space, self.action_space = space, gym.spaces.Discrete(len(table[0]))
