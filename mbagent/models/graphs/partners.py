@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mbagent.models.graphs.acts import act_columns
 from mbagent.models.graphs.habits import Habit
 from mbagent.models.graphs.units import Layout
+from mbagent.models.memory import thinned
 from mbagent.transitions import TransitionBatch
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -81,7 +82,7 @@ def likely_partners(factors: Sequence[int], among: Sequence[Partner], rows: Tran
         among: the candidates.
         rows: N transitions.
     """
-    some = rows.select(np.linspace(0, len(rows) - 1, min(len(rows), MOST_LOOKED_AT)).astype(np.int64))
+    some = thinned(rows, MOST_LOOKED_AT)
     if len(among) > MOST_CANDIDATES or len(some) < 2 * len(among) + 10:
         return [None] * len(factors)
     x = np.stack([partner.of(some) for partner in among], axis=1).astype(np.float64)
