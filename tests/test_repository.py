@@ -7,8 +7,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted(p for folder in ("mbagent", "envs", "scripts", "tests") for p in (ROOT / folder).rglob("*.py"))
-MAX_FILE_LINES = 350
-MAX_FUNCTION_LINES = 45
+MAX_FILE_LINES = 600
+MAX_FUNCTION_LINES = 60
 
 
 def lines_without_docstring(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
