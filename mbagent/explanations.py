@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.base import Floats, States
+from mbagent.models.particles import RARE
 from mbagent.planning.foresight import ForeseeingPlanner, Foresight, likeliest_futures
 from mbagent.planning.machine_planner import MachinePlanner
 from mbagent.planning.planner import Planner, PlannerSettings
@@ -87,6 +88,11 @@ class Explanation:
         machine_states: number of states of the reachable machine if it was solved as a whole; 0 if it is too large.
         futures: for each action its likeliest imagined futures, the likeliest first. After the action they follow the
             best behaviour found (with flat Monte Carlo, which has none, they are one step long).
+        rare: for each action the outcomes of less than ``RARE`` probability that take part in its value, those first that change
+            it most (with flat Monte Carlo, which has no values of them, the least likely first). Probabilities are posterior
+            means, of counts where the model is learned from counts.
+        effects: for each of these, by how much the action's value would differ if this outcome were as good as the others are on
+            average; 0 with flat Monte Carlo.
     """
 
     observation: Any
@@ -98,6 +104,8 @@ class Explanation:
     visits: Floats
     machine_states: int
     futures: tuple[tuple[Future, ...], ...]
+    rare: tuple[tuple[Step, ...], ...]
+    effects: tuple[tuple[float, ...], ...]
 
     def table(self, n_actions: int = 5) -> str:
         """The best actions and their futures, as text.
@@ -116,6 +124,10 @@ class Explanation:
         for a in rows:
             lines.append(f"likeliest futures of action {names[a]}:")
             lines += [f"  {future.probability:6.1%}  {_told(future)}" for future in self.futures[a]]
+            for step, effect in zip(self.rare[a], self.effects[a], strict=True):
+                lines.append(
+                    f"  {step.probability:6.2g}  {_told(Future((step,), step.probability))}: rare, {effect:+.3g} in value"
+                )
         return "\n".join(lines)
 
     def _headline(self) -> str:
@@ -147,6 +159,7 @@ def explain(policy: PlannerPolicy, observation: Any, n_futures: int = 3, n_steps
         visits=found.plan.visits[0],
         machine_states=found.machine_states,
         futures=_futures(policy, found, n_futures, n_steps),
+        **_rare(policy, found, n_futures),
     )
 
 
@@ -189,24 +202,48 @@ def _other_values(policy: PlannerPolicy, settings: PlannerSettings, state: State
     return found
 
 
-def _futures(policy: PlannerPolicy, found: Foresight, n_futures: int, n_steps: int) -> tuple[tuple[Future, ...], ...]:
+def _steps(policy: PlannerPolicy, found: Foresight, edges: Sequence[int]) -> tuple[Step, ...]:
+    """What some edges of the graph stand for."""
+    if len(edges) == 0:
+        return ()
     graph, actions = found.graph, policy.actions.decode(np.arange(policy.actions.n))
-
-    def future(path: list[int]) -> Future:
-        observations = policy.factored.decode(graph.states[graph.next_nodes[path]])
-        steps = tuple(
-            Step(
-                actions[graph.actions[edge]],
-                _row(observations, i),
-                float(graph.probabilities[edge]),
-                float(found.rewards[edge]),
-                bool(graph.terminated[edge]),
-            )
-            for i, edge in enumerate(path)
+    observations = policy.factored.decode(graph.states[graph.next_nodes[edges]])
+    return tuple(
+        Step(
+            actions[graph.actions[edge]],
+            _row(observations, i),
+            float(graph.probabilities[edge]),
+            float(found.rewards[edge]),
+            bool(graph.terminated[edge]),
         )
+        for i, edge in enumerate(edges)
+    )
+
+
+def _futures(policy: PlannerPolicy, found: Foresight, n_futures: int, n_steps: int) -> tuple[tuple[Future, ...], ...]:
+    def future(path: list[int]) -> Future:
+        steps = _steps(policy, found, path)
         return Future(steps, float(np.prod([step.probability for step in steps])))
 
     return tuple(tuple(map(future, paths)) for paths in likeliest_futures(found, n_futures, n_steps))
+
+
+def _rare(policy: PlannerPolicy, found: Foresight, most: int) -> dict[str, Any]:
+    """``rare`` and ``effects`` of Explanation, ``most`` of each action."""
+    graph, steps, effects = found.graph, [], []
+    for first, count in zip(graph.first[found.root], graph.counts[found.root], strict=True):
+        edges = np.arange(first, first + count)
+        chances, changes = graph.probabilities[edges], np.zeros(count)
+        if found.values is not None:
+            after = np.where(graph.terminated[edges], 0.0, policy.settings.gamma * found.values[graph.next_nodes[edges]])
+            worth = found.rewards[edges] + after
+            others = ((chances * worth).sum() - chances * worth) / np.maximum(1.0 - chances, 1e-12)
+            changes = chances * (worth - others)
+        kept = np.flatnonzero(chances < RARE)
+        kept = kept[np.lexsort((chances[kept], -np.abs(changes[kept])))][:most]
+        steps.append(_steps(policy, found, edges[kept].tolist()))
+        effects.append(tuple(changes[kept].tolist()))
+    return {"rare": tuple(steps), "effects": tuple(effects)}
 
 
 def _row(batch: Any, index: int) -> Any:

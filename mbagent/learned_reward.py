@@ -29,6 +29,9 @@ MAX_GRAPHS = 16
 
 STEPS, BATCH, LEARNING_RATE = 1500, 256, 0.01
 
+FLOOR = 0.01
+"""A network's probabilities of rewards under this count as none, where that does not explain the rewards worse."""
+
 HELD_OUT = 0.15
 """Share of episodes held out at first."""
 
@@ -95,7 +98,7 @@ class LearnedReward:
         self._codec, self._planes, self._seed = FactorCodec(cardinalities, n_actions), planes, seed
         self._parts = (n_actions,) if parts is None else tuple(parts)
         self._values = np.zeros(1)
-        self._classes = True
+        self._classes, self._floor = True, FLOOR
         self._graphs: ClassGraphs | None = None
         self._order = np.zeros(1)
         self._build()
@@ -166,10 +169,14 @@ class LearnedReward:
         self._train(distinct, torch.from_numpy(weights), STEPS)
 
     def _missed(self, rows: TransitionBatch) -> int:
-        """Number of rows that earn something else than most do, and are told as if they did not."""
-        off = self._order[0]
+        """Number of rows that earn something else than most do, and are told as if they did not.
+
+        What counts is the mean of all rows with the same observation, action and next observation: more cannot be told.
+        """
+        off, numbers = self._order[0], _numbered(rows)
+        means = (np.bincount(numbers, weights=rows.rewards) / np.bincount(numbers))[numbers]
         told = np.abs(self(rows.states, rows.actions, rows.next_states) - off)
-        return int((told < 0.5 * np.abs(rows.rewards - off)).sum())
+        return int((told < 0.5 * np.abs(means - off)).sum())
 
     def _as_graphs(self, rows: TransitionBatch) -> ClassGraphs | None:
         """Decision graphs for the rewards of some rows; None where there are too many different ones."""
@@ -212,6 +219,12 @@ class LearnedReward:
             (losses * weights[i]).mean().backward()  # type: ignore[no-untyped-call]
             optimizer.step()
         self._compile()
+        if self._classes:
+            errors = []
+            for self._floor in (0.0, FLOOR):
+                told = self(rows.states, rows.actions, rows.next_states)
+                errors.append(float((weights.double().numpy() * (told - rows.rewards) ** 2).sum()))
+            self._floor = FLOOR if errors[1] <= errors[0] else 0.0
 
     def _compile(self) -> None:
         """Packs the present weights for compiled code, where there is a kernel for the network."""
@@ -225,7 +238,7 @@ class LearnedReward:
             return np.full(len(actions), self._values[0])
         if self._graphs is not None:
             parts_of = (np.ascontiguousarray(part, dtype=np.int64) for part in (states, actions, next_states))
-            return self._weighed(class_chances(self._graphs, len(self._order), *parts_of), self._order)
+            return _weighed(class_chances(self._graphs, len(self._order), *parts_of), self._order)
         if self._packed is not None:
             return self._expected(torch.from_numpy(reward_outputs(self._packed, states, actions, next_states))).numpy()
         parts = [np.zeros(0)]
@@ -241,19 +254,11 @@ class LearnedReward:
     def _expected(self, out: Tensor) -> Tensor:
         if not self._classes:
             return out[:, 0].double() * float(self._values[1]) + float(self._values[0])
-        return torch.from_numpy(self._weighed(out.double().softmax(dim=1).numpy(), self._values))
-
-    @staticmethod
-    def _weighed(chances: Floats, values: Floats) -> Floats:
-        """Expected values [M] by chances [M, K]; of which those below 1% count as none."""
-        p = np.where(chances < 0.01, 0.0, chances)
-        # Not a matrix product: it would round differently for other numbers of rows.
-        expected: Floats = (p / p.sum(axis=1, keepdims=True) * values).sum(axis=1)
-        return expected
+        return torch.from_numpy(_weighed(out.double().softmax(dim=1).numpy(), self._values, self._floor))
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """All weights, as arrays."""
-        known = {"values": self._values.copy(), "classes": np.array(self._classes)}
+        known = {"values": self._values.copy(), "classes": np.array(self._classes), "floor": np.array(self._floor)}
         if self._graphs is not None:
             graphs = {f"graphs.{name}": array.copy() for name, array in self._graphs._asdict().items()}
             return {**known, "order": self._order.copy(), **graphs}
@@ -266,6 +271,7 @@ class LearnedReward:
             ValueError: the arrays are not those of such a reward.
         """
         self._values, self._classes = np.array(state["values"]), bool(state["classes"])
+        self._floor = float(state.get("floor", FLOOR))  # files of earlier versions have none
         self._graphs = None
         self._build()
         if "order" in state:
@@ -313,6 +319,20 @@ def _distinct(rows: TransitionBatch) -> tuple[TransitionBatch, NDArray[np.float3
     _, inverse = np.unique(triples[first], return_inverse=True)
     shares = counts / np.bincount(inverse, weights=counts)[inverse]
     return rows.select(first), shares.astype(np.float32)
+
+
+def _weighed(chances: Floats, values: Floats, floor: float = 0.0) -> Floats:
+    """Expected values [M] by chances [M, K]; of which those below ``floor`` count as none."""
+    p = np.where(chances < floor, 0.0, chances)
+    # Not a matrix product: it would round differently for other numbers of rows.
+    expected: Floats = (p / p.sum(axis=1, keepdims=True) * values).sum(axis=1)
+    return expected
+
+
+def _numbered(rows: TransitionBatch) -> NDArray[np.int64]:
+    """Numbers 0, 1, ... of the distinct (s, a, s'), int64 [N]."""
+    result: NDArray[np.int64] = np.unique(_triples(rows), return_inverse=True)[1]
+    return result
 
 
 def _triples(rows: TransitionBatch) -> NDArray[np.int64]:

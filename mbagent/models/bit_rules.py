@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.arithmetic import Floats, Ints
-from mbagent.models.causal_bits import settled_chance, split_bit, write_outcomes
+from mbagent.models.causal_bits import settled_chance, write_outcomes
 from mbagent.models.compiled_model import Outcomes, implements, outcomes, work_for
-from mbagent.models.particles import Particles, new_particles
+from mbagent.models.particles import MAIN, STRATA, Particles, begin, bit_chances, new_particles, share_out
 from mbagent.models.sparse_networks import Room, SparseNetworks, ask, leans_on_open, room_for, see_action, see_state
 from mbagent_envs._compiled import borrowed, compiled, inlined
 from mbagent_envs.random_keys import uniform_at
@@ -184,7 +184,7 @@ def rules_work(k: BitRules, n_grid: int) -> RulesWork:
         np.empty(n_outputs, dtype=np.int64),
         np.empty(n_outputs, dtype=np.int64),
         np.empty(n_outputs, dtype=np.int64),
-        new_particles(n_grid, n_outputs),
+        new_particles(n_grid, n_outputs, 2),
         room_for(k.networks),
     )
 
@@ -208,12 +208,14 @@ def rules_outcomes(k: BitRules, work: RulesWork, state: Ints, n_grid: int, key: 
     """See compiled_model."""
     table, bits, parents, networks, room, base, slot = k.table, k.bits, k.parents, k.networks, work.room, work.base, work.slot
     grid, total, still_open, p, chances, conditioned = (n_grid, key, offset), 0, work.open, work.p, room.chances, room.conditioned
-    first_point, points, low, high, mass, factors = p.first, p.points, p.low, p.high, p.mass, p.factors
+    factors, values = p.factors, np.empty(2, dtype=np.float64)
     see_state(networks, room, state)
     _copy(state, k.copies, base)
+    last = len(base) - 1
     for action in range(k.n_actions):
         see_action(networks, room, state, action)
-        first_point[0], points[0], low[0], high[0], mass[0], n_live, n_open = 0, n_grid, 0.0, 1.0, 1.0, 1, 0
+        n_open = 0
+        begin(p, n_grid, False)  # which bits are open is not known before
         for r in range(len(bits)):
             i, start, end, chance = bits[r, 0], bits[r, 4], bits[r, 5], 0.5
             place, weight = _by_state(r, action, state, bits, parents)
@@ -231,14 +233,20 @@ def rules_outcomes(k: BitRules, work: RulesWork, state: Ints, n_grid: int, key: 
                     base[i] = int(chance >= 1.0)
                     continue
             base[i], slot[i], still_open[n_open] = -1, n_open, i
-            for q in range(n_live):
-                if not shared and place < 0:
+            if shared:
+                bit_chances(chance, values)
+                share_out(p, -1, i, n_open, values, 2, i == last, grid)
+            n_main, n_strata = p.state[MAIN], p.state[STRATA]
+            for j in range(0 if shared else n_main + n_strata):
+                q = n_grid + j if j < n_strata else j - n_strata  # strata first
+                if place < 0:
                     chance = settled_chance(ask(networks, room, i, action, q, state, base, slot, factors))
-                elif not shared:
+                else:
                     chance = table[_by_outcome(q, place, weight, start, end, parents, base, slot, factors)]
-                n_live = split_bit(q, n_live, i, n_open, chance, grid, first_point, points, low, high, mass, factors)
+                bit_chances(chance, values)
+                share_out(p, q, i, n_open, values, 2, i == last, grid)
             n_open += 1
-        write_outcomes(total, n_live, base, still_open[:n_open], p, n_grid, out)
-        out.counts[action] = n_live
-        total += n_live
+        out.counts[action] = write_outcomes(total, base, still_open[:n_open], p, n_grid, out)
+        out.left_out[action] = p.left[0]
+        total += out.counts[action]
     return total

@@ -11,12 +11,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mbagent.models.arithmetic import Floats, Floats32, Ints
+from mbagent.models.arithmetic import Floats32, Ints
 from mbagent.models.bit_networks import CausalBits, condition, known_sum, predict
 from mbagent.models.compiled_model import Outcomes, implements, outcomes, work_for
-from mbagent.models.particles import FOUND, NEGLIGIBLE, Particles, new_particles
+from mbagent.models.particles import (
+    MAIN,
+    MASS,
+    NEGLIGIBLE,
+    STRATA,
+    Particles,
+    begin,
+    bit_chances,
+    n_outcomes,
+    new_particles,
+    share_out,
+    slot_of,
+    weigh,
+)
 from mbagent_envs._compiled import compiled, inlined
-from mbagent_envs.random_keys import derive_one, uniform_at
 
 SETTLED = math.log(1.0 / NEGLIGIBLE)
 """A bit whose logit is further from 0 has only one value worth drawing."""
@@ -72,7 +84,7 @@ def bits_work(k: CausalBits, n_grid: int) -> BitsWork:
         np.empty(n_outputs, dtype=np.int64),
         np.empty(n_outputs, dtype=np.int64),
         np.empty(n_outputs, dtype=np.int64),
-        new_particles(n_grid, n_outputs),
+        new_particles(n_grid, n_outputs, 2),
     )
 
 
@@ -97,51 +109,6 @@ def settled_chance(one: float) -> float:
 
 
 @inlined
-def split_bit(
-    q: int,
-    n_live: int,
-    bit: int,
-    w: int,
-    one: float,
-    grid: tuple[int, np.uint64, float],
-    first: Ints,
-    points: Ints,
-    low: Floats,
-    high: Floats,
-    mass: Floats,
-    factors: Ints,
-) -> int:
-    """As ``particles.split`` for a bit that is 1 with probability ``one``."""
-    n_grid, key, offset = grid
-    zero = 1.0 - one
-    if points[q] == 1:
-        value = 0 if one <= 0.0 else 1 if zero <= 0.0 else int(uniform_at(derive_one(key, np.uint64(first[q])), bit) >= zero)
-        factors[q, w] = value
-        mass[q] *= one if value else zero
-        return n_live
-    if one <= 0.0 or zero <= 0.0:
-        factors[q, w] = int(one > 0.0)
-        return n_live
-    border = low[q] + (high[q] - low[q]) * zero
-    taken = min(max(math.ceil(border * n_grid - offset) - first[q], 0), points[q])
-    if taken == points[q]:
-        high[q], factors[q, w] = border, 0
-        mass[q] *= zero
-    elif taken == 0:
-        low[q], factors[q, w] = border, 1
-        mass[q] *= one
-    else:
-        for v in range(w):
-            factors[n_live, v] = factors[q, v]
-        first[n_live], points[n_live], factors[n_live, w] = first[q] + taken, points[q] - taken, 1
-        low[n_live], high[n_live], mass[n_live] = border, high[q], mass[q] * one
-        points[q], high[q], factors[q, w] = taken, border, 0
-        mass[q] *= zero
-        n_live += 1
-    return n_live
-
-
-@inlined
 def _settle(logits: Floats32, group_of: Ints, certain: float, base: Ints, still_open: Ints, shown: Ints) -> tuple[int, int]:
     """Writes the settled bits to ``base``; returns how many are open, and how many of the settled ones are 1."""
     n_open, n_shown = 0, 0
@@ -160,19 +127,18 @@ def _settle(logits: Floats32, group_of: Ints, certain: float, base: Ints, still_
 
 
 @inlined
-def write_outcomes(total: int, n_live: int, base: Ints, still_open: Ints, p: Particles, n_grid: int, out: Outcomes) -> None:
-    """Writes the outcomes of an action from number ``total`` on, with their probabilities."""
-    out_states, ended, probabilities = out.states, out.terminated, out.probabilities
-    n_factors, found, mass, points, factors = len(base) - 1, 0.0, p.mass, p.points, p.factors
-    for q in range(n_live):
+def write_outcomes(total: int, base: Ints, still_open: Ints, p: Particles, n_grid: int, out: Outcomes) -> int:
+    """Writes the outcomes of an action from number ``total`` on, with their probabilities; returns their number."""
+    weigh(p, n_grid)
+    for i in range(n_outcomes(p)):
+        slot = slot_of(p, i, n_grid)
         for w in range(len(still_open)):
-            base[still_open[w]] = factors[q, w]
-        for f in range(n_factors):
-            out_states[total + q, f] = base[f]
-        ended[total + q] = base[n_factors] == 1
-        found += mass[q]
-    for q in range(n_live):
-        probabilities[total + q] = mass[q] / found if found >= FOUND else points[q] / n_grid
+            base[still_open[w]] = p.factors[slot, w]
+        for f in range(len(base) - 1):
+            out.states[total + i, f] = base[f]
+        out.terminated[total + i] = base[len(base) - 1] == 1
+        out.probabilities[total + i] = p.chances[slot, MASS]
+    return n_outcomes(p)
 
 
 @implements(outcomes, CausalBits)
@@ -186,7 +152,7 @@ def bits_outcomes(k: CausalBits, work: BitsWork, state: Ints, n_grid: int, key: 
     on, sums, hidden, logits = work.on, work.sums, work.hidden, work.logits
     state_sums, ready, known, group = work.state_sums, work.ready, work.known, work.group
     base, still_open, shown, p = work.base, work.open, work.shown, work.p
-    first_point, points, low, high, mass, factors = p.first, p.points, p.low, p.high, p.mass, p.factors
+    values = np.empty(2, dtype=np.float64)
     for h in range(len(sums)):
         sums[h] = k.bias[h]
     for bit in range(n_bits):
@@ -199,18 +165,23 @@ def bits_outcomes(k: CausalBits, work: BitsWork, state: Ints, n_grid: int, key: 
     for action in range(n_actions):
         predict(action, n_bits, on[:n_on], sums, first, last, last_bias, stay, k.activation, hidden, logits)
         n_open, n_shown = _settle(logits, group_of, certain, base, still_open, shown)
-        first_point[0], points[0], low[0], high[0], mass[0], n_live = 0, n_grid, 0.0, 1.0, 1.0, 1
+        begin(p, n_grid, n_open < 62 and 1 << n_open <= n_grid)
         for w in range(n_open):
             i = still_open[w]
             g, logit = group_of[i], float(logits[i])
             trusted, prior = g < 0 or abs(logit) >= certain, logit if k.correction else 0.0
-            if not trusted:
-                known_sum(g, action, n_bits, on[:n_on], shown[:n_shown], inputs, others, group_bias, state_sums, ready, known)
-            for q in range(n_live):
-                if not trusted:
-                    logit = condition(q, w, g, prior, still_open, others, readout, offsets, k.activation, known, group, factors)
-                n_live = split_bit(q, n_live, i, w, _chance(logit), grid, first_point, points, low, high, mass, factors)
-        write_outcomes(total, n_live, base, still_open[:n_open], p, n_grid, out)
-        out.counts[action] = n_live
-        total += n_live
+            if trusted:
+                bit_chances(_chance(logit), values)
+                share_out(p, -1, i, w, values, 2, i == n_bits, grid)
+                continue
+            known_sum(g, action, n_bits, on[:n_on], shown[:n_shown], inputs, others, group_bias, state_sums, ready, known)
+            n_main, n_strata = p.state[MAIN], p.state[STRATA]
+            for j in range(n_main + n_strata):
+                slot = n_grid + j if j < n_strata else j - n_strata  # strata first
+                logit = condition(slot, w, g, prior, still_open, others, readout, offsets, k.activation, known, group, p.factors)
+                bit_chances(_chance(logit), values)
+                share_out(p, slot, i, w, values, 2, i == n_bits, grid)
+        out.counts[action] = write_outcomes(total, base, still_open[:n_open], p, n_grid, out)
+        out.left_out[action] = p.left[0]
+        total += out.counts[action]
     return total

@@ -26,12 +26,14 @@ class Outcomes(NamedTuple):
         states: int64 [K, F].
         terminated: bool [K].
         probabilities: [K].
+        left_out: probability of the rare outcomes of each action that others stand for, see ``particles.py``, [A].
     """
 
     counts: NDArray[np.int64]
     states: NDArray[np.int64]
     terminated: NDArray[np.bool_]
     probabilities: NDArray[np.float64]
+    left_out: NDArray[np.float64]
 
 
 @runtime_checkable
@@ -58,7 +60,7 @@ def outcomes(kernel: Any, work: Any, state: Any, n_grid: int, key: Any, offset: 
         n_grid: draws for each action, at most.
         key: of the draws, as ``particles.start`` makes it of a seed.
         offset: likewise.
-        out: with room for twice ``n_grid`` outcomes of each action.
+        out: with room for twice ``n_grid`` outcomes of each action, and four at least.
 
     Returns:
         how many there are in all.

@@ -1,4 +1,14 @@
-"""Particles: runs of grid points that share an outcome so far (see ``systematic.py``, which draws with them)."""
+"""Particles: how the outcomes of a (state, action) are listed with few draws and without losing what is rare.
+
+Variables are taken one after the other; each particle stands for what those so far became. Where all outcomes fit, they are
+listed with their exact probabilities. Elsewhere particles are stratified. The *main* particles are runs of grid points, of which
+each value of a variable gets its share. A value too rare for the grid gets a particle of its own, a *stratum*: all outcomes in
+which this is the first rare value. It carries the stratum's exact probability, and draws what later variables become. So every
+possible value of every variable takes part, the weights add up to one, and expected values are unbiased (stratified sampling,
+Cochran 1977). Where there are more strata than room, two are merged: one of them is kept, with a chance in proportion to its
+weight, and gets the weight of both. Whether the episode ends is never merged with anything else.
+Shapes: n grid points, 2 n slots (main particles first, strata from slot n on), O open variables, K values.
+"""
 
 from __future__ import annotations
 
@@ -12,41 +22,61 @@ from mbagent.models.arithmetic import Floats, Ints
 from mbagent.models.base import Bools, Successors
 from mbagent.models.kernels import largest
 from mbagent.models.samplers import draw
-from mbagent_envs._compiled import compiled
+from mbagent_envs._compiled import compiled, inlined
 from mbagent_envs.random_keys import derive, derive_one, uniform_at, uniforms
 
 NEGLIGIBLE = 0.01
-"""Probabilities under this share of the factor's largest count as 0 here: noise of the fit, which planners would
-exploit."""
+"""Probabilities under this share of the variable's largest are noise of the fit where no observation stands behind them;
+planners would exploit them, so they count as 0."""
 
-FOUND = 0.95
-"""When the outcomes found hold this share of a row's mass, they are weighted by exact probability, else by points."""
+RARE = 0.05
+"""The least likely values of a variable, of less than this probability together, get strata of their own."""
 
 CHUNK = 2048
 """Rows worked on at once; bounds the memory."""
 
-Found: TypeAlias = tuple[Ints, Ints, Bools, Floats, Ints]
-"""Outcomes of some rows: counts [B], states [M, F], terminated [M], exact probabilities [M], points [M]."""
+MAIN, STRATA, EXACT, MERGES = range(4)
+"""Entries of ``Particles.state``: numbers of main particles and of strata, whether all outcomes are listed, merges so far."""
+
+_TAG = 1 << 32
+"""Variable number ``i`` with value ``k`` is stratum ``i * _TAG + k``; of whether the episode ends, ``-1 - k``."""
+
+_MERGE, _LATER = np.uint64(0x3E46E), np.uint64(0x1A7E5)
+"""Salts of the random numbers that decide between merged strata, and of those that strata draw with."""
+
+Found: TypeAlias = tuple[Ints, Ints, Bools, Floats, Floats]
+"""Outcomes of some rows: counts [B], states [M, F], terminated [M], probabilities [M]; and what ``Particles.left`` was, [B]."""
+
+Grid: TypeAlias = tuple[int, np.uint64, float]
+"""Number of grid points, the key of their random numbers, and the grid's offset; see ``start``."""
+
+
+FIRST, POINTS, TAG = range(3)
+"""Columns of ``Particles.grid``: lowest grid point, number of grid points, which stratum."""
+
+LOW, HIGH, MASS, SHARE = range(4)
+"""Columns of ``Particles.chances``: ends of the interval of [0, 1) that the points lie in; exact probability of the outcome so
+far, of a stratum all of its weight; probability that no value so far was rare."""
 
 
 class Particles(NamedTuple):
-    """The particles of one row, in slots 0 ... n - 1.
+    """The particles of one row. Few arrays: handing them from function to function costs time, and to compile that even more.
 
     Attributes:
-        first: lowest grid point, int64 [n].
-        points: number of grid points, int64 [n].
-        low: lower end of the interval, [n].
-        high: upper end, [n].
-        mass: exact probability of the outcome so far, [n].
-        factors: values of the row's open factors so far, int64 [n, O], in order.
+        grid: see FIRST, int64 [2 n, 3].
+        chances: see LOW, [2 n, 4].
+        factors: values of the row's open variables so far, int64 [2 n, O], in order.
+        rare: probabilities of the values of a variable that are set apart, [K].
+        state: see MAIN, int64 [4].
+        left: probability of the strata that found no room, [1].
     """
 
-    first: Ints
-    points: Ints
-    low: Floats
-    high: Floats
-    mass: Floats
+    grid: Ints
+    chances: Floats
     factors: Ints
+    rare: Floats
+    state: Ints
+    left: Floats
 
 
 @lru_cache(maxsize=4096)
@@ -57,19 +87,43 @@ def start(seed: int) -> tuple[np.uint64, float]:
 
 
 @compiled
-def new_particles(n_grid: int, n_outputs: int) -> Particles:
-    """Room for a row's particles."""
-    ends = np.empty((3, n_grid), dtype=np.float64)
-    counts = np.empty((2, n_grid), dtype=np.int64)
-    factors = np.empty((n_grid, n_outputs), dtype=np.int64)
-    return Particles(counts[0], counts[1], ends[0], ends[1], ends[2], factors)
+def new_particles(n_grid: int, n_outputs: int, n_values: int) -> Particles:
+    """Room for a row's particles, over so many variables of so many values at most."""
+    return Particles(
+        np.empty((2 * n_grid, 3), dtype=np.int64),
+        np.empty((2 * n_grid, 4), dtype=np.float64),
+        np.empty((2 * n_grid, n_outputs), dtype=np.int64),
+        np.empty(n_values, dtype=np.float64),
+        np.zeros(4, dtype=np.int64),
+        np.zeros(1, dtype=np.float64),
+    )
 
 
-@compiled
-def begin(p: Particles, n_grid: int) -> int:
-    """One particle with all points; returns 1."""
-    p.first[0], p.points[0], p.low[0], p.high[0], p.mass[0] = 0, n_grid, 0.0, 1.0, 1.0
-    return 1
+@inlined
+def begin(p: Particles, n_grid: int, exact: bool) -> None:
+    """One particle with all points. ``exact``: there is room to list all outcomes, at most 2 n."""
+    p.grid[0, FIRST], p.grid[0, POINTS], p.chances[0, LOW], p.chances[0, HIGH], p.chances[0, MASS], p.chances[0, SHARE] = (
+        0,
+        n_grid,
+        0.0,
+        1.0,
+        1.0,
+        1.0,
+    )
+    p.state[MAIN], p.state[STRATA], p.state[EXACT], p.state[MERGES] = 1, 0, int(exact), 0
+    p.left[0] = 0.0
+
+
+@inlined
+def n_outcomes(p: Particles) -> int:
+    """Number of particles."""
+    return int(p.state[MAIN] + p.state[STRATA])
+
+
+@inlined
+def slot_of(p: Particles, i: int, n_grid: int) -> int:
+    """Slot of particle number i: main ones first."""
+    return int(i if i < p.state[MAIN] else n_grid + i - p.state[MAIN])
 
 
 @compiled
@@ -101,21 +155,116 @@ def settle(probs: Floats, b: int, outputs: Ints, base: Ints) -> None:
                 base[i] = -1
 
 
+@inlined
+def bit_chances(one: float, values: Floats) -> None:
+    """Writes the distribution of a bit that is 1 with probability ``one``."""
+    values[0], values[1] = 1.0 - one, one
+
+
+@inlined
+def n_possible(values: Floats, start: int, n: int) -> int:
+    """How many of ``n`` numbers of ``values`` are above 0."""
+    count = 0
+    for k in range(start, start + n):
+        if values[k] > 0.0:
+            count += 1
+    return count
+
+
 @compiled
-def split(
-    p: Particles, q: int, n_live: int, i: int, w: int, values: Floats, n: int, n_grid: int, key: np.uint64, offset: float
-) -> int:
-    """Shares the points of particle ``q`` among the values of factor i, open factor number ``w``; returns how many live.
+def _set_apart(values: Floats, rare: Floats, n: int) -> float:
+    """Moves the rare values [n] to ``rare`` [n], scales the others to sum to one; returns the probability of all rare ones.
+
+    Rare are those that are less probable than some bound and together have less than RARE; of equally probable ones all or none.
+    """
+    bound, total = RARE, RARE
+    while total >= RARE:
+        total = 0.0
+        for k in range(n):
+            if values[k] < bound:
+                total += values[k]
+        if total < RARE:
+            break
+        bound *= 0.5
+    for k in range(n):
+        rare[k] = 0.0
+        if total > 0.0:
+            if values[k] < bound:
+                rare[k], values[k] = values[k], 0.0
+            values[k] /= 1.0 - total
+    return total
+
+
+@compiled
+def share_out(p: Particles, only: int, unit: int, w: int, values: Floats, n: int, ends: bool, grid: Grid) -> None:
+    """Shares particles among the values of variable ``unit``, open variable number ``w``.
+
+    Args:
+        p: the particles.
+        only: slot of one particle, where probabilities depend on what it became so far (strata must be done before main ones);
+            -1 for all.
+        unit: number of the variable, which random numbers it draws with.
+        w: where its values are written to.
+        values: probability of each value, summing to one, overwritten, [n].
+        n: number of values.
+        ends: whether the variable tells if the episode ends.
+        grid: see Grid.
+    """
+    points, chances, factors, apart, state = p.grid, p.chances, p.factors, p.rare, p.state
+    n_grid, n_main, rare = grid[0], state[MAIN], 0.0
+    if state[EXACT]:
+        for q in range(n_main if only < 0 else 1):
+            _list_values(p, max(q, only), w, values, n)
+        return
+    for slot in range(n_grid, n_grid + state[STRATA]):
+        if only < 0 or slot == only:
+            factors[slot, w] = draw(values, n, uniform_at(derive_one(grid[1], _LATER + np.uint64(slot)), unit))
+    if only >= n_grid:
+        return
+    rare = _set_apart(values, apart, n)
+    for i in range(n_main if only < 0 else 1):
+        q = max(i, only)
+        here = points[q, POINTS] / n_grid * chances[q, SHARE]
+        for k in range(n if rare > 0.0 else 0):
+            if apart[k] > 0.0:
+                _add_stratum(p, q, unit, k, w, here * apart[k], ends, grid)
+        chances[q, MASS] *= 1.0 - rare
+        chances[q, SHARE] *= 1.0 - rare
+        state[MAIN] = _split(p, q, state[MAIN], unit, w, values, n, grid)
+
+
+@compiled
+def _list_values(p: Particles, q: int, w: int, values: Floats, n: int) -> None:
+    """One particle for each possible value; the first keeps the slot."""
+    chances, factors, state = p.chances, p.factors, p.state
+    slot, mass, last = q, chances[q, MASS], state[MAIN]
+    for k in range(n):
+        if values[k] > 0.0:
+            if slot < 0:
+                slot = last
+                last += 1
+                for v in range(w):
+                    factors[slot, v] = factors[q, v]
+            factors[slot, w], chances[slot, MASS] = k, mass * values[k]
+            slot = -1
+    state[MAIN] = last
+
+
+@compiled
+def _split(p: Particles, q: int, n_live: int, i: int, w: int, values: Floats, n: int, grid: Grid) -> int:
+    """Shares the points of main particle ``q`` among the values of variable i; returns how many main ones there are.
 
     The first value with a point keeps the slot; particles for further ones are appended.
     """
-    if p.points[q] == 1:
-        chosen = draw(values, n, uniform_at(derive_one(key, np.uint64(p.first[q])), i))
-        p.factors[q, w] = chosen
-        p.mass[q] *= values[chosen]
+    points, chances, factors = p.grid, p.chances, p.factors
+    n_grid, key, offset = grid
+    if points[q, POINTS] == 1:
+        chosen = draw(values, n, uniform_at(derive_one(key, np.uint64(points[q, FIRST])), i))
+        factors[q, w] = chosen
+        chances[q, MASS] *= values[chosen]
         return n_live
-    low, width, mass = p.low[q], p.high[q] - p.low[q], p.mass[q]
-    point, left, below = p.first[q], p.points[q], 0.0
+    low, width, mass = chances[q, LOW], chances[q, HIGH] - chances[q, LOW], chances[q, MASS]
+    point, left, below = points[q, FIRST], points[q, POINTS], 0.0
     slot, last = q, n - 1
     while values[last] <= 0.0:
         last -= 1
@@ -130,9 +279,14 @@ def split(
             slot = n_live
             n_live += 1
             for v in range(w):
-                p.factors[slot, v] = p.factors[q, v]
-        p.first[slot], p.points[slot], p.factors[slot, w] = point, taken, k
-        p.low[slot], p.high[slot], p.mass[slot] = lower, upper, mass * values[k]
+                factors[slot, v] = factors[q, v]
+        points[slot, FIRST], points[slot, POINTS], factors[slot, w] = point, taken, k
+        chances[slot, LOW], chances[slot, HIGH], chances[slot, MASS], chances[slot, SHARE] = (
+            lower,
+            upper,
+            mass * values[k],
+            chances[q, SHARE],
+        )
         slot = -1
         point += taken
         left -= taken
@@ -140,55 +294,116 @@ def split(
 
 
 @compiled
-def write(p: Particles, n_live: int, base: Ints, still_open: Ints, n_open: int, total: int, found: Found) -> None:
-    """Writes a row's outcomes from number ``total`` on: ``base`` [O] with the open factors' values filled in."""
-    _, states, terminated, mass, points = found
+def _slot_for(p: Particles, tag: int, ends: bool, n_grid: int) -> int:
+    """Slot of a stratum: its own, a new one of mass 0, or that of another which it is to be merged with."""
+    points, chances, state = p.grid, p.chances, p.state
+    last, room = n_grid + int(state[STRATA]), n_grid if ends else max(1, n_grid - 1)  # one is kept for the end
+    for slot in range(n_grid, last):
+        if points[slot, TAG] == tag:
+            return slot
+        if points[slot, TAG] < 0:
+            room = n_grid
+    if state[STRATA] < room:
+        state[STRATA] += 1
+        chances[last, MASS] = 0.0
+        return last
+    slot = n_grid + int(state[MERGES] % state[STRATA])
+    for _ in range(state[STRATA]):
+        if (points[slot, TAG] < 0) != ends:
+            slot = slot + 1 if slot + 1 < last else n_grid
+    return slot
+
+
+@compiled
+def _add_stratum(p: Particles, q: int, unit: int, k: int, w: int, weight: float, ends: bool, grid: Grid) -> None:
+    """Adds main particle q with value k of a variable to the strata, with some weight."""
+    points, chances, factors, state = p.grid, p.chances, p.factors, p.state
+    n_grid, key, _ = grid
+    tag = -1 - k if ends else unit * _TAG + k
+    slot = _slot_for(p, tag, ends, n_grid)
+    before, total = chances[slot, MASS], chances[slot, MASS] + weight
+    if before > 0.0:
+        state[MERGES] += 1
+        kept = uniform_at(derive_one(key, _MERGE), state[MERGES]) * total >= weight
+        if points[slot, TAG] != tag:
+            p.left[0] += weight if kept else before
+        if kept:
+            chances[slot, MASS] = total
+            return
+    for v in range(w):
+        factors[slot, v] = factors[q, v]
+    factors[slot, w], chances[slot, MASS], points[slot, TAG] = k, total, tag
+
+
+@compiled
+def weigh(p: Particles, n_grid: int) -> None:
+    """Turns the particles' masses into their probabilities, summing to one.
+
+    Where every outcome was found they are exact, else main particles have what their grid points stand for.
+    """
+    points, chances, state = p.grid, p.chances, p.state
+    found, total = 0.0, 0.0
+    for i in range(n_outcomes(p)):
+        found += chances[slot_of(p, i, n_grid), MASS]
+    if found < 1.0 - 1e-9:
+        for q in range(state[MAIN]):
+            chances[q, MASS] = points[q, POINTS] / n_grid * chances[q, SHARE]
+    for i in range(n_outcomes(p)):
+        total += chances[slot_of(p, i, n_grid), MASS]
+    for i in range(n_outcomes(p)):
+        chances[slot_of(p, i, n_grid), MASS] /= total
+
+
+@compiled
+def write(p: Particles, base: Ints, still_open: Ints, n_open: int, n_grid: int, total: int, found: Found) -> int:
+    """Writes a row's outcomes from number ``total`` on, the open factors' values filled in to ``base`` [O]; returns how many."""
+    _, states, terminated, probabilities, _ = found
     n_factors = states.shape[1]
-    for q in range(n_live):
+    weigh(p, n_grid)
+    for i in range(n_outcomes(p)):
+        slot = slot_of(p, i, n_grid)
         for w in range(n_open):
-            base[still_open[w]] = p.factors[q, w]
+            base[still_open[w]] = p.factors[slot, w]
         for f in range(n_factors):
-            states[total + q, f] = base[f]
-        terminated[total + q] = base[n_factors] == 1
-        mass[total + q], points[total + q] = p.mass[q], p.points[q]
+            states[total + i, f] = base[f]
+        terminated[total + i] = base[n_factors] == 1
+        probabilities[total + i] = p.chances[slot, MASS]
+    return n_outcomes(p)
 
 
 @compiled
 def room(n_rows: int, n_grid: int, n_outputs: int) -> Found:
     """Room for as many outcomes as there can be."""
-    most = n_rows * n_grid
+    most = 2 * n_rows * n_grid
     return (
         np.empty(n_rows, dtype=np.int64),
         np.empty((most, n_outputs - 1), dtype=np.int64),
         np.empty(most, dtype=np.bool_),
         np.empty(most, dtype=np.float64),
-        np.empty(most, dtype=np.int64),
+        np.zeros(n_rows, dtype=np.float64),
     )
 
 
 @compiled
 def used(found: Found, total: int) -> Found:
     """The part of the room that was used."""
-    counts, states, terminated, mass, points = found
-    return counts, states[:total], terminated[:total], mass[:total], points[:total]
+    counts, states, terminated, probabilities, left = found
+    return counts, states[:total], terminated[:total], probabilities[:total], left
 
 
-def assemble(parts: list[Found], n_samples: int, n_outputs: int) -> Successors:
+def assemble(parts: list[Found], n_outputs: int) -> Successors:
     """Successors from the outcomes found in consecutive runs of rows."""
     if not parts:
         none = np.zeros((0, n_outputs - 1), dtype=np.int64)
         return Successors(np.zeros(1, dtype=np.int64), none, np.zeros(0, dtype=np.bool_), np.zeros(0))
     if len(parts) > 1:
-        counts, states, terminated, mass, points = (np.concatenate(column) for column in zip(*parts, strict=True))
+        counts, states, terminated, probabilities, _ = (np.concatenate(column) for column in zip(*parts, strict=True))
     else:
-        counts, states, terminated, mass, points = parts[0]
+        counts, states, terminated, probabilities, _ = parts[0]
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    totals = np.add.reduceat(mass, offsets[:-1])
-    exact = np.repeat(totals >= FOUND, counts)
-    weights = np.where(exact, mass / np.repeat(totals, counts), points / n_samples)
-    return Successors(offsets, states, terminated, weights)
+    return Successors(offsets, states, terminated, probabilities)
 
 
 def rows_at_once(n_samples: int, n_outputs: int) -> int:
     """How many rows to work on at once."""
-    return max(1, min(CHUNK, (1 << 24) // (n_samples * n_outputs)))
+    return max(1, min(CHUNK, (1 << 24) // (2 * n_samples * n_outputs)))

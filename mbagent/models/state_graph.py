@@ -31,7 +31,7 @@ class GraphArrays(NamedTuple):
     """What compiled kernels need of a graph, with room to grow; N nodes and M edges of them are in use.
 
     Attributes:
-        states, groups, expanded, first, counts: see StateGraph, [room, ...].
+        states, groups, expanded, first, counts, left_out: see StateGraph, [room, ...].
         reached: whether a node was reached by a transition that did not end the episode, bool [room].
         tags: hash of each node's state and group, uint64 [room].
         next_nodes, probabilities, terminated, sources, actions: see StateGraph, [room].
@@ -45,6 +45,7 @@ class GraphArrays(NamedTuple):
     expanded: Bools
     first: Indices
     counts: Indices
+    left_out: Floats
     reached: Bools
     tags: Keys
     next_nodes: Indices
@@ -77,7 +78,7 @@ def add_node(graph: GraphArrays, state: Indices, group: int) -> int:
     for f in range(len(state)):
         graph.states[node, f] = state[f]
     for a in range(graph.counts.shape[1]):
-        graph.first[node, a], graph.counts[node, a] = 0, 0
+        graph.first[node, a], graph.counts[node, a], graph.left_out[node, a] = 0, 0, 0.0
     sizes[0] = node + 1
     return int(node)
 
@@ -104,6 +105,7 @@ def expand_with(
     outcomes(kernel, work, graph.states[node], n_samples, key, offset, out)
     i = 0
     for action in range(len(out.counts)):
+        graph.left_out[node, action] = out.left_out[action]
         for _ in range(out.counts[action]):
             add_edge(graph, node, action, out.states[i], out.terminated[i], out.probabilities[i])
             i += 1
@@ -111,21 +113,28 @@ def expand_with(
 
 
 @compiled
+def most_outcomes(n_actions: int, n_samples: int) -> int:
+    """Outcomes that a state may have at most; see ``compiled_model.outcomes``."""
+    return 2 * n_actions * max(n_samples, 2)
+
+
+@compiled
 def room_for_outcomes(n_actions: int, n_factors: int, n_samples: int) -> Outcomes:
     """Room for all that may follow a state."""
-    most = 2 * n_actions * n_samples
+    most = most_outcomes(n_actions, n_samples)
     return Outcomes(
         np.empty(n_actions, dtype=np.int64),
         np.empty((most, n_factors), dtype=np.int64),
         np.empty(most, dtype=np.bool_),
         np.empty(most, dtype=np.float64),
+        np.zeros(n_actions, dtype=np.float64),
     )
 
 
 @compiled
 def _expand_all(kernel: Any, graph: GraphArrays, nodes: Indices, n_samples: int, key: np.uint64, offset: float) -> int:
     """Expands nodes [B] as long as there is room; returns how many."""
-    n_actions, most = graph.counts.shape[1], 2 * n_samples * graph.counts.shape[1]
+    n_actions, most = graph.counts.shape[1], most_outcomes(graph.counts.shape[1], n_samples)
     made = work_for(kernel, n_samples), room_for_outcomes(n_actions, graph.states.shape[1], n_samples)
     lent, kernel, graph = borrowed(made), borrowed(kernel), borrowed(graph)
     done = 0
@@ -183,7 +192,7 @@ def _place_all(tags: Keys, slots: Indices) -> None:
         slots[place] = node
 
 
-_NODE_FIELDS = ("states", "groups", "expanded", "first", "counts", "reached", "tags")
+_NODE_FIELDS = ("states", "groups", "expanded", "first", "counts", "left_out", "reached", "tags")
 _EDGE_FIELDS = ("next_nodes", "probabilities", "terminated", "sources", "actions")
 
 
@@ -199,6 +208,7 @@ class StateGraph:
     Attributes (arrays are views of what is filled so far):
         states: int64 [N, F]. groups: int64 [N]. expanded: bool [N].
         first, counts: int64 [N, A].
+        left_out: float64 [N, A], probability of rare successors that others stand for, see ``particles.py``.
         next_nodes: int64 [M]. probabilities: float64 [M]. terminated: bool [M].
         sources: int64 [M], the node each successor comes from. actions: int64 [M].
         arrays: the same for compiled kernels, with room to grow.
@@ -213,7 +223,8 @@ class StateGraph:
         none = np.zeros(0, dtype=np.int64)
         table, flags = np.zeros((0, n_actions), dtype=np.int64), np.zeros(0, dtype=np.bool_)
         self.arrays = GraphArrays(
-            np.zeros((0, n_factors), dtype=np.int64), none, flags, table, table, flags, none.astype(np.uint64),
+            np.zeros((0, n_factors), dtype=np.int64), none, flags, table, table, table.astype(np.float64), flags,
+            none.astype(np.uint64),
             none, none.astype(np.float64), flags, none, none,
             np.full(FEWEST_SLOTS, -1, dtype=np.int64),
             derive(np.arange(n_factors, dtype=np.uint64), 0x5851F42D) | np.uint64(1),
@@ -241,6 +252,7 @@ class StateGraph:
     expanded: Bools
     first: Indices
     counts: Indices
+    left_out: Floats
     next_nodes: Indices
     probabilities: Floats
     terminated: Bools
@@ -288,7 +300,7 @@ class StateGraph:
         size = len(self)
         if self.kernel is not None:
             key, offset = grid_of(seed)
-            of_one = 2 * n_samples * self.model.n_actions
+            of_one = most_outcomes(self.model.n_actions, n_samples)
             while len(nodes):
                 most = of_one * max(1, min(len(nodes), AT_ONCE // of_one))
                 self.reserve(most, most)

@@ -1,19 +1,14 @@
-"""Successors for planning: systematic draws through the ancestral inverse distribution function, equal ones merged.
+"""Successors for planning: listed where they are few, else stratified systematic draws, equal ones merged; see ``particles.py``.
 
-A row starts as one *particle* that holds the n grid points (j + offset) / n of [0, 1). At each factor the
-particle's interval is split in proportion to P(y_i | s, a, y_<i) and its points go to the parts; parts without a
-point are dropped. So work grows with the number of different outcomes and not with n, no outcome of probability 2 /
-n or more is missed, and an outcome's expected share of the points is its probability. The offset is the same for
-all rows: two actions, or two states, differ by their effects and not by luck. A particle down to a single point
-goes on with fresh numbers, hashed from (seed, point, factor), for its interval would soon be too narrow for a
-float. Shapes: B batch, F state factors, O = F + 1 output factors, K largest cardinality, n points a row, M
-successors.
+Main particles hold the grid points (j + offset) / n of [0, 1). At each factor a particle's interval is split in proportion to
+P(y_i | s, a, y_<i) and its points go to the parts; parts without a point are dropped. So work grows with the number of different
+outcomes and not with n. The offset is the same for all rows: two actions, or two states, differ by their effects and not by
+chance. A particle down to a single point goes on with fresh numbers, hashed from (seed, point, factor), for its interval would
+soon be too narrow for a float. Shapes: B batch, F state factors, O = F + 1 output factors, K largest cardinality, n points a row,
+M successors.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
-from typing import TypeAlias
 
 import numpy as np
 
@@ -27,8 +22,11 @@ from mbagent.models.kernels import (
     trusted,
 )
 from mbagent.models.particles import (
+    MAIN,
     NEGLIGIBLE,
+    STRATA,
     Found,
+    Grid,
     assemble,
     begin,
     new_particles,
@@ -36,28 +34,25 @@ from mbagent.models.particles import (
     room,
     rows_at_once,
     settle,
-    split,
+    share_out,
     start,
     used,
     write,
 )
 from mbagent_envs._compiled import compiled
-from mbagent_envs.random_keys import derive, uniforms
-
-Conditional: TypeAlias = Callable[[int, Ints, Ints], Floats]
-"""(factor i, row of each particle [P], outcomes so far [P, O]) -> P(y_i | s, a, y_<i), float64 [P, cardinality of i]."""
 
 
 @compiled
-def _independent(probs: Floats, outputs: Ints, n_grid: int, key: np.uint64, offset: float) -> Found:
-    n_rows, n_outputs = probs.shape[0], probs.shape[1]
-    p, found = new_particles(n_grid, n_outputs), room(n_rows, n_grid, n_outputs)
+def _independent(probs: Floats, outputs: Ints, grid: Grid) -> Found:
+    n_rows, n_outputs, n_grid = probs.shape[0], probs.shape[1], grid[0]
+    p, found = new_particles(n_grid, n_outputs, probs.shape[2]), room(n_rows, n_grid, n_outputs)
     base, still_open = np.empty(n_outputs, dtype=np.int64), np.empty(n_outputs, dtype=np.int64)
     values = np.empty(probs.shape[2], dtype=np.float64)
     total = 0
     for b in range(n_rows):
-        n_live, n_open = begin(p, n_grid), 0
+        n_open = 0
         settle(probs, b, outputs, base)
+        begin(p, n_grid, _fits(probs, b, outputs, base, n_grid))
         for i in range(n_outputs):
             if base[i] >= 0:
                 continue
@@ -65,13 +60,26 @@ def _independent(probs: Floats, outputs: Ints, n_grid: int, key: np.uint64, offs
                 values[k] = probs[b, i, k]
             prune(values, outputs[i])
             still_open[n_open] = i
-            for q in range(n_live):
-                n_live = split(p, q, n_live, i, n_open, values, outputs[i], n_grid, key, offset)
+            share_out(p, -1, i, n_open, values, outputs[i], i == n_outputs - 1, grid)
             n_open += 1
-        found[0][b] = n_live
-        write(p, n_live, base, still_open, n_open, total, found)
-        total += n_live
+        found[0][b] = write(p, base, still_open, n_open, n_grid, total, found)
+        total += found[0][b]
     return used(found, total)
+
+
+@compiled
+def _fits(probs: Floats, b: int, outputs: Ints, base: Ints, n_grid: int) -> bool:
+    """Whether all outcomes of row b can be listed, by its factors that are still open in ``base`` [O]."""
+    n = 1
+    for i in range(len(outputs)):
+        if base[i] < 0:
+            top, possible = probs[b, i].max(), 0
+            for k in range(outputs[i]):
+                possible += int(probs[b, i, k] >= NEGLIGIBLE * top)
+            n *= possible
+            if n > n_grid:
+                return False
+    return True
 
 
 @compiled
@@ -83,12 +91,10 @@ def _causal(
     layout: Layout,
     group: GroupWeights,
     certain: float,
-    n_grid: int,
-    key: np.uint64,
-    offset: float,
+    grid: Grid,
 ) -> Found:
-    n_outputs = probs.shape[1]
-    p, found = new_particles(n_grid, n_outputs), room(len(states), n_grid, n_outputs)
+    n_outputs, n_grid = probs.shape[1], grid[0]
+    p, found = new_particles(n_grid, n_outputs, probs.shape[2]), room(len(states), n_grid, n_outputs)
     base, still_open, columns = np.empty((3, n_outputs), dtype=np.int64)
     active = np.empty(n_outputs + layout.n_steps, dtype=np.int64)
     sums = np.empty((2, group.bias.shape[1]), dtype=np.float32)  # of what all particles share; of one particle
@@ -96,29 +102,36 @@ def _causal(
     values, total = np.empty(probs.shape[2], dtype=np.float64), 0
     for b in range(len(states)):
         n_active = active_columns(states, b, actions[b], layout, active)
-        n_live, n_open = begin(p, n_grid), 0
+        n_open, possible = 0, 1
         settle(probs, b, layout.outputs, base)
         for i in range(n_outputs):
+            if not (group.group_of[i] < 0 or trusted(probs, b, i, layout, group, certain)):
+                base[i] = -1
+            possible = min(possible * (layout.outputs[i] if base[i] < 0 else 1), n_grid + 1)
+        begin(p, n_grid, possible <= n_grid)
+        for i in range(n_outputs):
             n, trust = layout.outputs[i], group.group_of[i] < 0 or trusted(probs, b, i, layout, group, certain)
-            if trust and base[i] >= 0:
+            if base[i] >= 0:
                 continue
-            base[i], still_open[n_open] = -1, i
-            if not trust:
-                _known_input(i, base, active, n_active, layout, group, columns, sums)
-            for q in range(n_live):
-                if trust:
-                    values[:] = probs[b, i]
-                else:
-                    copy_row(sums, 0, sums, 1)
-                    n_columns = _open_columns(p.factors, q, still_open, n_open, layout, group, columns)
-                    add_columns(group.columns, group.group_of[i], columns, n_columns, sums, 1)
-                    finish(b, i, logits, layout, group, sums, 1, hidden, row_logits, values)
+            still_open[n_open] = i
+            if trust:
+                values[:] = probs[b, i]
                 prune(values, n)
-                n_live = split(p, q, n_live, i, n_open, values, n, n_grid, key, offset)
+                share_out(p, -1, i, n_open, values, n, i == n_outputs - 1, grid)
+            else:
+                _known_input(i, base, active, n_active, layout, group, columns, sums)
+            n_main, n_strata = p.state[MAIN], p.state[STRATA]
+            for j in range(0 if trust else n_main + n_strata):
+                slot = n_grid + j if j < n_strata else j - n_strata  # strata first
+                copy_row(sums, 0, sums, 1)
+                n_columns = _open_columns(p.factors, slot, still_open, n_open, layout, group, columns)
+                add_columns(group.columns, group.group_of[i], columns, n_columns, sums, 1)
+                finish(b, i, logits, layout, group, sums, 1, hidden, row_logits, values)
+                prune(values, n)
+                share_out(p, slot, i, n_open, values, n, i == n_outputs - 1, grid)
             n_open += 1
-        found[0][b] = n_live
-        write(p, n_live, base, still_open, n_open, total, found)
-        total += n_live
+        found[0][b] = write(p, base, still_open, n_open, n_grid, total, found)
+        total += found[0][b]
     return used(found, total)
 
 
@@ -162,8 +175,9 @@ def independent_successors(probs: Floats, outputs: Ints, n_samples: int, seed: i
     """
     key, offset = start(seed)
     step = rows_at_once(n_samples, len(outputs))
-    parts = [_independent(probs[b : b + step], outputs, n_samples, key, offset) for b in range(0, len(probs), step)]
-    return assemble(parts, n_samples, len(outputs))
+    grid = (n_samples, key, offset)
+    parts = [_independent(probs[b : b + step], outputs, grid) for b in range(0, len(probs), step)]
+    return assemble(parts, len(outputs))
 
 
 def causal_successors(
@@ -186,42 +200,5 @@ def causal_successors(
     parts = []
     for b in range(0, len(states), step):
         given = (states[b : b + step], actions[b : b + step], logits[b : b + step], probs[b : b + step])
-        parts.append(_causal(*given, layout, group, certain, n_samples, key, offset))
-    return assemble(parts, n_samples, len(layout.outputs))
-
-
-def ancestral_successors(n_rows: int, outputs: Ints, conditional: Conditional, n_samples: int, seed: int) -> Successors:
-    """Successors under any conditioner with exact ancestral probabilities, factor by factor for all rows at once.
-
-    Args:
-        n_rows: number of rows B.
-        outputs: int64 [O], cardinalities; the last factor is ``terminated``.
-        conditional: the distribution of a factor given those before it.
-        n_samples: grid points n a row.
-        seed: which grid offset and fresh numbers.
-    """
-    key, offset = start(seed)
-    row, first = np.arange(n_rows), np.zeros(n_rows, dtype=np.int64)
-    points, mass = np.full(n_rows, n_samples, dtype=np.int64), np.ones(n_rows)
-    low, high = np.zeros(n_rows), np.ones(n_rows)
-    factors = np.zeros((n_rows, len(outputs)), dtype=np.int64)
-    for i in range(len(outputs)):
-        probs = conditional(i, row, factors)
-        probs = np.where(probs < NEGLIGIBLE * probs.max(axis=1, keepdims=True), 0.0, probs)
-        probs /= probs.sum(axis=1, keepdims=True)
-        ends = low[:, None] + (high - low)[:, None] * np.cumsum(probs, axis=1)
-        last = outputs[i] - 1 - np.argmax(probs[:, ::-1] > 0.0, axis=1)
-        upto = np.clip(np.ceil(ends * n_samples - offset).astype(np.int64) - first[:, None], 0, points[:, None])
-        upto[np.arange(int(outputs[i])) >= last[:, None]] = np.repeat(points, outputs[i] - last)
-        taken = np.diff(upto, axis=1, prepend=0)
-        fresh = uniforms(derive(np.full(len(row), key), first), len(outputs))[:, i]
-        drawn = np.minimum((np.cumsum(probs, axis=1) <= fresh[:, None]).sum(axis=1), last)
-        taken[points == 1] = np.arange(int(outputs[i])) == drawn[points == 1, None]
-        q, value = np.nonzero(taken)
-        single = points[q] == 1
-        low, high = ends[q, value] - (high - low)[q] * probs[q, value], ends[q, value]
-        first = np.where(single, first[q], first[q] + upto[q, value] - taken[q, value])
-        row, points, mass, factors = row[q], taken[q, value], mass[q] * probs[q, value], factors[q]
-        factors[:, i] = value
-    counts = np.bincount(row, minlength=n_rows)
-    return assemble([(counts, factors[:, :-1], factors[:, -1] == 1, mass, points)], n_samples, len(outputs))
+        parts.append(_causal(*given, layout, group, certain, (n_samples, key, offset)))
+    return assemble(parts, len(layout.outputs))

@@ -23,7 +23,8 @@ class FlatMonteCarlo:
     "Several simulations are rolled out up to a bounded number of steps using the transition sampling method. At the end
     of each simulation the reward is counted, and the action which produced the greatest reward is selected."
     By default an action is judged by the mean of its simulations; ``choice="greatest"`` is the paper's wording, which
-    seeks risk wherever the world is stochastic.
+    seeks risk wherever the world is stochastic. What the few simulations of an action do not happen to draw has no part in its
+    value, so outcomes that are rare and decide are missed here; the other planners list them.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:

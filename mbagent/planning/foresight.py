@@ -28,6 +28,7 @@ class Foresight:
         root: the root's node.
         rewards: float64 [M], of the graph's successor edges.
         behaviour: int64 [N], the action that the best behaviour found takes in each node; -1 where imagination ends.
+        values: float64 [N], of the graph's states; None with flat Monte Carlo.
         machine_states: number of states if the whole reachable machine was solved, so that nothing was searched; else 0.
     """
 
@@ -36,6 +37,7 @@ class Foresight:
     root: int
     rewards: Floats
     behaviour: Indices
+    values: Floats | None = None
     machine_states: int = 0
 
 

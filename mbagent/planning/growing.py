@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.compiled_model import work_for
-from mbagent.models.state_graph import GraphArrays, expand_with, room_for_outcomes
+from mbagent.models.state_graph import GraphArrays, expand_with, most_outcomes, room_for_outcomes
 from mbagent_envs._compiled import borrowed, compiled
 from mbagent_envs.random_keys import derive_one, uniform_at
 
@@ -118,7 +118,7 @@ def grow_around(
         if size == 0:
             budget = 0
             break
-        most = 2 * n_samples * n_actions * size
+        most = most_outcomes(n_actions, n_samples) * size
         if graph.sizes[0] + most > len(graph.tags) or graph.sizes[1] + most > len(graph.sources):
             break
         for i in range(size):

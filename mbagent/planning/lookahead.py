@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.state_graph import StateGraph
+from mbagent.models.state_graph import StateGraph, most_outcomes
 from mbagent.planning.growing import ABOUT_AS_LIKELY, LAYER_WIDTH, grow_around
 from mbagent_envs.random_keys import derive
 
@@ -110,7 +110,7 @@ def _grow_compiled(graph: StateGraph, roots: NDArray[np.int64], max_states: int,
         budget, begin, at_once = max_states, len(graph), 64
         reach, depth = np.zeros(0), np.zeros(0, dtype=np.int64)
         while budget > 0:
-            most = 2 * n_samples * n_actions * min(budget, at_once)
+            most = most_outcomes(n_actions, n_samples) * min(budget, at_once)
             graph.reserve(most, most)
             more = len(graph.arrays.tags) - len(reach)
             reach, depth = np.append(reach, np.zeros(more)), np.append(depth, np.zeros(more, dtype=np.int64))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from mbagent.planning.leaf_values import LOWEST_KNOWN
 from mbagent.planning.lookahead import grow_lookahead
 from mbagent.planning.planner import Plan, PlannerSettings, best_actions
 from mbagent.planning.rehearsal import Way, best_way
-from mbagent.planning.value_iteration import Machine, Values, break_ties, solve
+from mbagent.planning.value_iteration import Machine, Values, break_ties, doubt, solve, undecided
 
 REHEARSED: dict[str, Any] = {"time_budget": None, "reuse_tree": False}
 """Settings while ways to look ahead are compared: the outcome must hang on neither the clock nor the order."""
@@ -61,6 +62,7 @@ class MachinePlanner:
         self._machine: Machine | None = None
         self._imagined: StateGraph | None = None
         self._way: Way | None = None
+        self._told = False
 
     def set_model(self, model: TransitionModel, start_states: States) -> None:
         """See Planner. The machine is generated at the next ``plan``."""
@@ -68,7 +70,7 @@ class MachinePlanner:
 
     def set_goal(self, goal: Goal) -> None:
         """See Planner. The machine stays, its values go."""
-        self._goal, self._way = goal, None
+        self._goal, self._way, self._told = goal, None, False
         if self._machine is not None:
             self._machine.values = None
 
@@ -86,12 +88,28 @@ class MachinePlanner:
         if len(known) and machine.graph is not None and machine.values is not None:
             values[known] = machine.values.q[nodes[known]]
             scores[known] = break_ties(machine.graph, machine.values.q, nodes[known], self.settings.gamma)
+            self._tell_doubt(machine.bounds, nodes[known], scores[known], values[known])
         unknown = np.flatnonzero(nodes < 0)
         for begin in range(0, len(unknown), ROOTS_AT_ONCE):
             some = unknown[begin : begin + ROOTS_AT_ONCE]
             found = self._imagine(roots[some])
             values[some], visits[some], scores[some] = found.solution.q[found.nodes], found.visits, found.scores
+            if not self._told:
+                bounds = doubt(found.graph, found.solution, self.settings.gamma)
+                self._tell_doubt(bounds, found.nodes, scores[some], values[some])
         return Plan(best_actions(scores), values, visits)
+
+    def _tell_doubt(self, bounds: Floats | None, nodes: Indices, scores: Floats, values: Floats) -> None:
+        """Warns, once for each goal, where rare outcomes that have no part in a plan could change it."""
+        if self._told or bounds is None or not undecided(scores, values, bounds[nodes]).any():
+            return
+        self._told, settings = True, self.settings
+        warnings.warn(
+            f"More outcomes are rare than plans have room for, so that others stand for some of them; values may be off by up to "
+            f"{bounds[nodes].max():.3g}, which could change the choice of an action: raise n_samples (now {settings.n_samples}) "
+            f"and lookahead_samples (now {settings.lookahead_samples}) in policy_kwargs.",
+            stacklevel=2,
+        )
 
     def foresee(self, root: States) -> Foresight:
         """What the plan from one root [1, F] rests on; see Foresight."""
@@ -107,7 +125,8 @@ class MachinePlanner:
     def _foresight(self, found: Imagined, machine_states: int) -> Foresight:
         plan = Plan(best_actions(found.scores), found.solution.q[found.nodes], found.visits)
         behaviour = best_behaviour(found.graph, found.solution.q, self.settings.gamma, found.tried)
-        return Foresight(plan, found.graph, int(found.nodes[0]), found.solution.rewards, behaviour, machine_states)
+        solution = found.solution
+        return Foresight(plan, found.graph, int(found.nodes[0]), solution.rewards, behaviour, solution.v, machine_states)
 
     def _imagine(self, roots: States) -> Imagined:
         """Imagines around each root [R, F]; here a lookahead machine, solved, without a search."""

@@ -12,10 +12,11 @@ from mbagent.models.reachable import grow_reachable
 from mbagent.models.state_graph import GraphArrays, Indices, StateGraph
 from mbagent.planning.goal import Goal
 from mbagent.planning.leaf_values import LOWEST_KNOWN, LeafValues, evaluate
+from mbagent.planning.planner import best_actions
 from mbagent_envs._compiled import compiled
 
 TOLERANCE = 1e-7
-"""Sweeps stop when no value moves by more than this share of the largest reward."""
+"""Sweeps stop when no value moves by more than this share of the largest expected reward."""
 
 MAX_SWEEPS = 5000
 
@@ -138,9 +139,12 @@ def sweep(
     lows = np.full(n_groups, np.inf)
     # Every group stops by its own measure: its values must not depend on what else is solved in the same call.
     moved, scale = np.zeros(n_groups), np.full(n_groups, 1e-12)
-    for e in range(len(rewards)):
-        g = graph.groups[graph.sources[e]]
-        scale[g] = max(scale[g], abs(rewards[e]))
+    for s in range(len(v)):
+        for a in range(q.shape[1]):
+            expected = 0.0  # of a rare reward only that counts: it may be a thousand times any other
+            for e in range(graph.first[s, a], graph.first[s, a] + graph.counts[s, a]):
+                expected += graph.probabilities[e] * rewards[e]
+            scale[graph.groups[s]] = max(scale[graph.groups[s]], abs(expected))
     for _ in range(max_sweeps):
         moved[:] = 0.0
         lows[:] = np.inf
@@ -213,6 +217,50 @@ def _lead_to_news(graph: GraphArrays, q: Floats, tie: float, gamma: float, max_s
             break
 
 
+def doubt(graph: StateGraph, values: Values, gamma: float) -> Floats | None:
+    """How far each action's value [N, A] may be off since other rare outcomes stand for some; None where all take part.
+
+    On each step that is at most their probability times the range of all values found; later steps follow the best behaviour.
+    """
+    if not graph.left_out.any():
+        return None
+    span = np.zeros(len(values.frontier))
+    for group in range(len(span)):
+        edges = np.flatnonzero(graph.groups[graph.sources] == group)
+        if len(edges):
+            after = np.where(graph.terminated[edges], 0.0, gamma * values.v[graph.next_nodes[edges]])
+            span[group] = np.ptp(values.rewards[edges] + after)
+    bounds = graph.left_out * span[graph.groups][:, None]
+    _add_later_doubt(graph.arrays, values.q, gamma, bounds.copy(), bounds)
+    return bounds
+
+
+@compiled
+def _add_later_doubt(graph: GraphArrays, q: Floats, gamma: float, first: Floats, bounds: Floats) -> None:
+    """Adds to ``bounds`` [N, A], which begins as ``first``, what comes of later steps."""
+    for _ in range(MAX_NEWS_SWEEPS):
+        moved = 0.0
+        for s in range(len(q) - 1, -1, -1):
+            for a in range(q.shape[1]):
+                later = 0.0
+                for e in range(graph.first[s, a], graph.first[s, a] + graph.counts[s, a]):
+                    if not graph.terminated[e]:
+                        node = graph.next_nodes[e]
+                        later += graph.probabilities[e] * bounds[node, np.argmax(q[node])]
+                moved = max(moved, abs(first[s, a] + gamma * later - bounds[s, a]))
+                bounds[s, a] = first[s, a] + gamma * later
+        if moved <= 1e-3 * first.max():
+            break
+
+
+def undecided(scores: Floats, q: Floats, bounds: Floats) -> Bools:
+    """In which rows [R] another action than the chosen one could be best, were values ``q`` [R, A] off by ``bounds``."""
+    rows, best = np.arange(len(q)), best_actions(scores)
+    rivals = q + bounds > (q - bounds)[rows, best][:, None]
+    rivals[rows, best] = False
+    return np.asarray((rivals & (bounds > 0.0)).any(axis=1), dtype=np.bool_)
+
+
 DRAWS, MOST_SAMPLES = 4_000_000, 256
 """Draws of a machine in which there is luck, and of each (state, action) pair, at most: a small machine affords more."""
 
@@ -230,6 +278,7 @@ class Machine:
     Attributes:
         graph: the complete machine, or None.
         values: its solution under the goal last given, or None.
+        bounds: see ``doubt``.
     """
 
     def __init__(self, model: TransitionModel, start: States, max_states: int, n_samples: int, seed: int) -> None:
@@ -241,10 +290,13 @@ class Machine:
             finer, complete = grow_reachable(model, start, max_states, more, seed)
             self.graph = finer if complete else graph
         self.values: Values | None = None
+        self.bounds: Floats | None = None
 
     def set_goal(self, goal: Goal, gamma: float) -> None:
         """Solves the machine for a goal."""
-        self.values = solve(self.graph, goal, gamma) if self.graph is not None else None
+        if self.graph is not None:
+            self.values = solve(self.graph, goal, gamma)
+            self.bounds = doubt(self.graph, self.values, gamma)
 
     def find(self, states: States) -> NDArray[np.int64]:
         """Nodes [B] of expanded states [B, F]; -1 where a state is not in the machine."""

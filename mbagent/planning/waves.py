@@ -198,7 +198,7 @@ def measure_spans(graph: GraphArrays, roots: Ints, tables: Tables) -> None:
             low[g], high[g] = min(low[g], tables.v[node]), max(high[g], tables.v[node])
     for edge in range(m):
         g = graph.groups[graph.sources[edge]]
-        high[g] = max(high[g], low[g] + abs(tables.rewards[edge]))
+        high[g] = max(high[g], low[g] + graph.probabilities[edge] * abs(tables.rewards[edge]))
     for r in range(len(roots)):
         span = high[graph.groups[roots[r]]] - low[graph.groups[roots[r]]]
         tables.spans[r] = span if 0.0 < span < np.inf else 1.0

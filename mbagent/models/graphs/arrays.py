@@ -11,12 +11,15 @@ from numpy.typing import NDArray
 from mbagent.models.graphs.compiled import Graphs
 from mbagent.models.graphs.units import Layout
 
+SAVED = tuple(name for name in Graphs._fields if name != "noise")
+"""Fields that are kept in files: how graphs are read for planning is no part of what was learned."""
+
 _FLOATS = ("rate", "spread", "stays", "novelty", "base", "still")
 
 
 def to_arrays(graphs: Graphs) -> dict[str, NDArray[Any]]:
     """The graphs' arrays by name."""
-    return {name: array.copy() for name, array in graphs._asdict().items()}
+    return {name: array.copy() for name, array in graphs._asdict().items() if name in SAVED}
 
 
 def table_of(array: NDArray[Any], width: int) -> NDArray[np.int64]:
@@ -41,12 +44,12 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]], layout: Layout, n_columns: i
     Raises:
         ValueError: they are no graphs of these units.
     """
-    missing = sorted(set(Graphs._fields) ^ set(arrays))
+    missing = sorted(set(SAVED) ^ set(arrays))
     if missing:
         raise ValueError(f"These weights are no decision graphs (first difference: {missing[0]!r}).")
-    kinds = {name: np.float64 if name in _FLOATS else np.int64 for name in Graphs._fields}
+    kinds = {name: np.float64 if name in _FLOATS else np.int64 for name in SAVED}
     flat: dict[str, Any] = {name: np.ascontiguousarray(array, dtype=kinds[name]).reshape(-1) for name, array in arrays.items()}
-    graphs = Graphs(**flat)
+    graphs = Graphs(**flat, noise=np.zeros(1))
     if not _sound(graphs, layout, n_columns):
         raise ValueError(
             "These weights do not fit: they are no graphs of these units; load them into a model of the same environment."

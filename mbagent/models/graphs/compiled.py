@@ -16,7 +16,7 @@ from mbagent.models.graphs.leaves import LeafPrior, fitted_prior
 from mbagent.models.graphs.partners import chained
 from mbagent.models.graphs.search import Search
 from mbagent.models.graphs.units import BEYOND, Layout, Question
-from mbagent_envs._compiled import compiled
+from mbagent_envs._compiled import compiled, inlined
 
 Floats: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
@@ -41,6 +41,8 @@ class Graphs(NamedTuple):
         novelty: probability that what follows a pair is none of what was seen to follow it, [pairs].
         base: where the novelties of each unit are drawn from, after ``start`` [U + 1], [sum of cardinalities].
         still: probability that a unit without graphs changes, [1].
+        noise: 0, or for planning: values no observation stands behind count as impossible where they are less probable than
+            this share of the likeliest, [1].
     """
 
     changing: Ints
@@ -58,6 +60,7 @@ class Graphs(NamedTuple):
     start: Ints
     base: Floats
     still: Floats
+    noise: Floats
 
 
 class Nodes:
@@ -134,6 +137,7 @@ def build(layout: Layout, asked: Sequence[Question], found: Sequence[Search], ha
         np.concatenate([[0], np.cumsum(layout.outputs)]).astype(np.int64),
         np.concatenate([habit.base for habit in habits]),
         np.asarray([still]),
+        np.zeros(1),
     )
 
 
@@ -226,15 +230,65 @@ def show_next_meetings(following: Ints, layout: Layout, on: Bools) -> None:
         on[n + m] = meets(following, layout.cells, layout.next_meetings[m])
 
 
+@inlined
+def without_noise(rate: float, spread: float, n: int, noise: float) -> float:
+    """A leaf's rate for planning, of one of ``n`` values; negative where no observation stands behind it.
+
+    Leaves whose rows all agree, as ``spread`` tells, are sure. Bits are decided at once, other values once all are known.
+    """
+    if noise == 0.0 or spread > 0.0:
+        return rate
+    if 1.0 - rate < noise * rate:
+        return 1.0
+    if n > 2:
+        return -rate
+    return 0.0 if rate < noise * (1.0 - rate) else rate
+
+
+@compiled
+def with_rest(
+    out: Floats,
+    base: Floats,
+    start: int,
+    n: int,
+    value: int,
+    total: float,
+    slack: float,
+    stays: float,
+    novelty: float,
+    known: bool,
+    asked: bool,
+    noise: float,
+) -> None:
+    """Completes a unit's distribution, ``out`` from ``start`` on, by the present value and by what never came.
+
+    The graphs give the rates of all values but the present one, which has the rest. Where the unit was never seen to stay, the
+    rest is taken for an error of estimation unless it is larger than such an error can be; for planning, also where graphs ask
+    for anything (``asked``), so that rows in which it stayed may have been others.
+    """
+    stay = 1.0 - total
+    observed = not known or (stays > 0.0 and (stay > slack or not asked))
+    if known:
+        stay = max(0.0, stay - slack) if stays == 0.0 else max(stay, min(slack, stays))
+    out[start + value] = stay if observed or noise == 0.0 else -stay
+    scale, top, left = (1.0 - novelty) / (total + stay), 0.0, 0.0
+    for k in range(start, start + n):
+        top = max(top, abs(out[k]) * scale + novelty * base[k])
+    for k in range(start, start + n):
+        chance = abs(out[k]) * scale + novelty * base[k]
+        out[k] = chance if out[k] > 0.0 or chance >= noise * top else 0.0
+        left += out[k]
+    for k in range(start, start + n if noise > 0.0 else start):
+        out[k] /= left
+
+
 @compiled
 def distributions(
     units: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs, on: Bools, values: Ints, out: Floats
 ) -> None:
     """Writes value and next distribution of some units to ``values`` [U] and, from ``start[unit]`` on, to ``out``.
 
-    The graphs give the rates of all values but the present one, which has the rest. Where the unit was never seen to stay,
-    the rest is taken for an error of estimation unless it is larger than such an error can be. All units are done in one
-    call: handing the graphs over costs more than a unit does.
+    All units are done in one call: handing the graphs over costs more than a unit does.
     """
     for unit in units:
         first, n, start = layout.first[unit], layout.outputs[unit], graphs.start[unit]
@@ -245,27 +299,24 @@ def distributions(
                     value = member - first
                     break
         values[unit] = value
+        noise = graphs.noise[0]
         pair = graphs.pairs[unit] + layout.acts.way[action] * n + value
-        total, slack = 0.0, 0.0
+        total, slack, asked = 0.0, 0.0, False
         for k in range(start, start + n):
             out[k] = 0.0
         for entry in range(graphs.entries[pair], graphs.entries[pair + 1]):
             node = graphs.nodes[entry]
+            asked |= graphs.column[node] >= 0
             while graphs.column[node] >= 0:
                 node = graphs.on[node] if on[graphs.column[node]] else graphs.off[node]
-            out[start + graphs.values[entry]] = graphs.rate[node]
-            total += graphs.rate[node]
+            rate = without_noise(graphs.rate[node], graphs.spread[node], n, noise)
+            out[start + graphs.values[entry]] = rate
+            total += abs(rate)
             slack += 3.0 * graphs.spread[node]
         known = graphs.entries[pair + 1] > graphs.entries[pair]
         if n == 2:
-            rate = out[start + 1] if known else graphs.still[0] if value == 0 else 1.0 - graphs.still[0]
+            still = graphs.still[0] if graphs.still[0] >= noise else 0.0
+            rate = out[start + 1] if known else still if value == 0 else 1.0 - still
             out[start], out[start + 1] = 1.0 - rate, rate
             continue
-        stay, stays = 1.0 - total, graphs.stays[pair]
-        if known:
-            stay = max(0.0, stay - slack) if stays == 0.0 else max(stay, min(slack, stays))
-        out[start + value] = stay
-        novelty = graphs.novelty[pair]
-        scale = (1.0 - novelty) / (total + stay)
-        for k in range(n):
-            out[start + k] = out[start + k] * scale + novelty * graphs.base[start + k]
+        with_rest(out, graphs.base, start, n, value, total, slack, graphs.stays[pair], graphs.novelty[pair], known, asked, noise)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints
 from mbagent.models.graphs.units import Layout
+from mbagent.models.particles import NEGLIGIBLE
 from mbagent_envs._compiled import compiled
 
 
@@ -37,6 +38,16 @@ def couple(coupling: int, state: Ints, rates: Floats, still: Bools, layout: Layo
         out[k] /= total + none
     out[n] = none / (total + none)
     return int(n)
+
+
+@compiled
+def leave_out_none(chances: Floats, n: int) -> None:
+    """Takes "none", the last of ``n`` chances, for an error of the bits' rates where it is negligible beside the likeliest."""
+    none, top = chances[n - 1], chances[:n].max()
+    if 0.0 < none < NEGLIGIBLE * top:
+        chances[n - 1] = 0.0
+        for k in range(n - 1):
+            chances[k] /= 1.0 - none
 
 
 @compiled

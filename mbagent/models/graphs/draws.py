@@ -253,6 +253,18 @@ def settled(probs: Floats, start: int, n: int) -> int:
 
 
 @compiled
+def only_possible(probs: Floats, start: int, n: int) -> int:
+    """The only one of ``n`` values with a probability above 0, or -1."""
+    best = -1
+    for k in range(n):
+        if probs[start + k] > 0.0:
+            if best >= 0:
+                return -1
+            best = k
+    return best
+
+
+@compiled
 def uncertain(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, units: Ints) -> Bools:
     """In which rows some units need their late graphs, bool [B, len(units)]."""
     w, result = work_space(layout, graphs, graphs), np.zeros((len(states), len(units)), dtype=np.bool_)

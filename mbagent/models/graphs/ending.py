@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, meets
 from mbagent.models.graphs.units import Layout
+from mbagent.models.particles import NEGLIGIBLE
 from mbagent_envs._compiled import inlined
 
 
@@ -31,7 +32,9 @@ def end_graph(layout: Layout, late: Graphs) -> tuple[Ints, NDArray[np.int32], Fl
         pair = late.pairs[len(layout.outputs) - 2] + 2 * way
         if late.entries[pair + 1] > late.entries[pair]:
             first[way] = late.nodes[late.entries[pair]]
-    return first, np.stack([late.column, late.off, late.on], axis=1).astype(np.int32), late.rate
+    sure, rate = late.spread == 0.0, late.rate
+    rate = np.where(sure & (rate < NEGLIGIBLE), 0.0, np.where(sure & (rate > 1.0 - NEGLIGIBLE), 1.0, rate))
+    return first, np.stack([late.column, late.off, late.on], axis=1).astype(np.int32), rate
 
 
 @inlined

@@ -6,14 +6,15 @@ number of its variables.
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
 from mbagent.models.compiled_model import Outcomes, implements, outcomes, work_for
 from mbagent.models.graphs.acts import Acts
 from mbagent.models.graphs.compiled import Bools, Floats, Ints, meets
-from mbagent.models.graphs.draws import settled
+from mbagent.models.graphs.couplings import leave_out_none
+from mbagent.models.graphs.draws import only_possible
 from mbagent.models.graphs.ending import end_rate
 from mbagent.models.graphs.laws import leave_out
 from mbagent.models.graphs.lean import (
@@ -28,11 +29,21 @@ from mbagent.models.graphs.lean import (
     show_state,
     touched_units,
 )
-from mbagent.models.particles import FOUND, Particles, begin, new_particles, prune, split
+from mbagent.models.particles import (
+    MAIN,
+    MASS,
+    STRATA,
+    Grid,
+    Particles,
+    begin,
+    n_outcomes,
+    n_possible,
+    new_particles,
+    share_out,
+    slot_of,
+    weigh,
+)
 from mbagent_envs._compiled import compiled, inlined
-
-Grid: TypeAlias = tuple[int, np.uint64, float]
-"""Number of draws, their key and offset; see ``particles.py``."""
 
 
 class GraphWork(NamedTuple):
@@ -86,7 +97,7 @@ def graph_work(g: Lean, n_grid: int) -> GraphWork:
         np.empty(n_units, dtype=np.int64),
         np.zeros(n_couplings, dtype=np.int64),
         np.empty((width, 2), dtype=np.int64),
-        new_particles(n_grid, width),
+        new_particles(n_grid, width, max(g.units[:, OUTPUTS].max(), n_units) + 1),
         np.empty(n_factors, dtype=np.int64),
         np.empty(n_factors, dtype=np.int64),
     )
@@ -101,7 +112,7 @@ def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.u
     shown, columns, on = g.shown, g.columns, work.on
     units, members, entries = g.units, g.members, g.entries
     entry, node, leaf = g.entry, g.node, g.leaf
-    habit, base_rates, still = g.habit, g.base, g.still
+    habit, base_rates, still, noise = g.habit, g.base, g.still, g.noise[0]
     exactly, row, touched = g.exactly, g.row, g.touched
     by_meeting, always, rates = g.by_meeting, g.always, work.rates
     joint, different, words = work.joint, work.different, work.words
@@ -119,19 +130,23 @@ def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.u
         )
         _show_action(acts, action, len(columns), True, on)
         way = acts.way[action]
-        rates_of(listed[:n], state, way, on, units, members, entries, entry, node, leaf, habit, base_rates, still, values, rates)
+        rates_of(
+            listed[:n], state, way, on, units, members, entries, entry, node, leaf, habit, base_rates, still, noise, values, rates
+        )
         for f in range(len(state)):
             base[f] = state[f]
-        n_live, n_open, ended = _settle(
+        begin(p, n_grid, _fits(listed[:n], units, rates, per_coupling, late_end, n_grid))
+        n_open, ended = _settle(
             listed[:n], units, members, exactly, values, rates, joint, coupled, per_coupling, opened, p, base, late_end, grid
         )
         if late_end:
-            n_live, n_open = _end(g, work, way, n_live, n_open, grid), n_open + 1
+            _end(g, work, way, n_open, grid)
+            n_open += 1
         _show_action(acts, action, len(columns), False, on)
-        _write(total, n_live, n_open, ended, base, opened, coupled, units, members, p, n_grid, out)
+        n_live = _write(total, n_open, ended, base, opened, coupled, units, members, p, n_grid, out)
         if len(counts) or len(met):
             n_live = leave_out(counts, met, weights, cells, state, out.states, out.terminated, out.probabilities, total, n_live)
-        out.counts[action] = n_live
+        out.counts[action], out.left_out[action] = n_live, p.left[0]
         total += n_live
     for i in range(n_different):
         for column in range(shown[different[i]], shown[different[i] + 1]):
@@ -140,16 +155,18 @@ def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.u
 
 
 @compiled
-def _end(g: Lean, work: GraphWork, way: int, n_live: int, n_open: int, grid: Grid) -> int:
-    """Draws whether the episode ends, for each particle given what it became so far; returns how many particles there are."""
+def _end(g: Lean, work: GraphWork, way: int, n_open: int, grid: Grid) -> None:
+    """Draws whether the episode ends, for each particle given what it became so far."""
     p, joint, following, opened, end = work.p, work.joint, work.following, work.opened, len(g.units) - 2
-    for q in range(n_live):
-        _fill(following, work.base, opened, n_open, work.coupled, g.units, g.members, p.factors[q])
+    n_main, n_strata = p.state[MAIN], p.state[STRATA]
+    for j in range(n_main + n_strata):
+        slot = grid[0] + j if j < n_strata else j - n_strata  # strata first
+        _fill(following, work.base, opened, n_open, work.coupled, g.units, g.members, p.factors[slot])
         joint[1] = end_rate(
             g.end_first[way],
             g.end_node,
             g.end_rate,
-            g.still[0],
+            0.0,
             following,
             work.on,
             g.factor,
@@ -158,10 +175,8 @@ def _end(g: Lean, work: GraphWork, way: int, n_live: int, n_open: int, grid: Gri
             g.next_meetings,
         )
         joint[0] = 1.0 - joint[1]
-        prune(joint, 2)
-        n_live = split(p, q, n_live, end, n_open, joint, 2, grid[0], grid[1], grid[2])
+        share_out(p, slot, end, n_open, joint, 2, True, grid)
     opened[n_open, 0], opened[n_open, 1] = end, -1
-    return n_live
 
 
 @inlined
@@ -169,6 +184,24 @@ def _show_action(acts: Acts, action: int, first: int, shown: bool, on: Bools) ->
     """Switches an action's columns, which begin at ``first``, on or off."""
     for i in range(acts.first[action], acts.first[action + 1]):
         on[first + acts.column[i]] = shown
+
+
+@compiled
+def _fits(touched: Ints, units: Ints, rates: Floats, per_coupling: Ints, ends_late: bool, n_grid: int) -> bool:
+    """Whether all outcomes of a row can be listed; ``per_coupling`` is all 0, and is so again afterwards."""
+    possible = 1
+    for unit in touched:
+        coupling = units[unit, COUPLING]
+        if coupling >= 0:
+            per_coupling[coupling] += int(rates[units[unit, START] + 1] > 0.0)
+        elif not (ends_late and unit == len(units) - 2):
+            possible = min(possible * n_possible(rates, units[unit, START], units[unit, OUTPUTS]), n_grid + 1)
+    for unit in touched:
+        coupling = units[unit, COUPLING]
+        if coupling >= 0 and per_coupling[coupling] > 0:
+            possible = min(possible * (per_coupling[coupling] + 1), n_grid + 1)  # one more: none
+            per_coupling[coupling] = 0
+    return possible <= n_grid
 
 
 @inlined
@@ -187,9 +220,9 @@ def _settle(
     base: Ints,
     ends_late: bool,
     grid: Grid,
-) -> tuple[int, int, bool]:
-    """Writes what is sure to ``base`` and shares the particles over the rest; returns (particles, open ones, whether it ends)."""
-    n_units, n_live, n_open, ended = len(units), begin(p, grid[0]), 0, False
+) -> tuple[int, bool]:
+    """Writes what is sure to ``base`` and shares the particles over the rest; returns (open ones, whether it ends)."""
+    n_units, n_open, ended = len(units), 0, False
     for i in range(len(touched)):
         unit = touched[i]
         if units[unit, COUPLING] >= 0:
@@ -198,21 +231,21 @@ def _settle(
         if ends_late and unit == n_units - 2:
             continue
         n, start = units[unit, OUTPUTS], units[unit, START]
-        best = settled(rates, start, n)
+        best = only_possible(rates, start, n)
         if best < 0:
             for k in range(n):
                 joint[k] = rates[start + k]
-            n_live = _share(p, n_live, unit, n_open, joint, n, grid)
+            share_out(p, -1, unit, n_open, joint, n, unit == n_units - 2, grid)
             opened[n_open, 0], opened[n_open, 1] = unit, -1
             n_open += 1
         elif unit == n_units - 2:
             ended = best == 1
         elif best != values[i]:
             _put(base, unit, best, units, members)
-    n_live, n_open = _settle_couplings(
-        touched, units, members, exactly, rates, joint, coupled, per_coupling, opened, p, base, n_live, n_open, grid
+    n_open = _settle_couplings(
+        touched, units, members, exactly, rates, joint, coupled, per_coupling, opened, p, base, n_open, grid
     )
-    return n_live, n_open, ended
+    return n_open, ended
 
 
 @inlined
@@ -228,10 +261,9 @@ def _settle_couplings(
     opened: Ints,
     p: Particles,
     base: Ints,
-    n_live: int,
     n_open: int,
     grid: Grid,
-) -> tuple[int, int]:
+) -> int:
     """The same for couplings."""
     n_units, first = len(units), 0
     for q in range(len(exactly)):
@@ -243,17 +275,16 @@ def _settle_couplings(
         if best >= 0:
             _choose(base, coupled, first, n, best, units, members)
         else:
-            n_live = _share(p, n_live, n_units + q, n_open, joint, n + 1, grid)
+            share_out(p, -1, n_units + q, n_open, joint, n + 1, False, grid)
             opened[n_open, 0], opened[n_open, 1] = first, n
             n_open += 1
         first += n
-    return n_live, n_open
+    return n_open
 
 
 @inlined
 def _write(
     total: int,
-    n_live: int,
     n_open: int,
     ended: bool,
     base: Ints,
@@ -264,18 +295,18 @@ def _write(
     p: Particles,
     n_grid: int,
     out: Outcomes,
-) -> None:
-    """Writes the outcomes that the particles stand for from number ``total`` on, weighted as ``particles.assemble`` does."""
-    states, terminated, probabilities, factors, mass = out.states, out.terminated, out.probabilities, p.factors, p.mass
-    everything = 0.0
-    for q in range(n_live):
-        everything += mass[q]
-    for q in range(n_live):
-        terminated[total + q] = ended
-        last = _fill(states[total + q], base, opened, n_open, coupled, units, members, factors[q])
+) -> int:
+    """Writes the outcomes that the particles stand for from number ``total`` on; returns their number."""
+    states, terminated, probabilities, factors = out.states, out.terminated, out.probabilities, p.factors
+    weigh(p, n_grid)
+    for i in range(n_outcomes(p)):
+        slot = slot_of(p, i, n_grid)
+        terminated[total + i] = ended
+        last = _fill(states[total + i], base, opened, n_open, coupled, units, members, factors[slot])
         if last >= 0:
-            terminated[total + q] = factors[q, last] == 1
-        probabilities[total + q] = mass[q] / everything if everything >= FOUND else p.points[q] / n_grid
+            terminated[total + i] = factors[slot, last] == 1
+        probabilities[total + i] = p.chances[slot, MASS]
+    return n_outcomes(p)
 
 
 @inlined
@@ -293,15 +324,6 @@ def _fill(state: Ints, base: Ints, opened: Ints, n_open: int, coupled: Ints, uni
         else:
             _put(state, number, chosen[v], units, members)
     return int(end)
-
-
-@inlined
-def _share(p: Particles, n_live: int, number: int, n_open: int, joint: Floats, n: int, grid: Grid) -> int:
-    """Shares all particles among the values of a unit or coupling that is uncertain; returns how many there are."""
-    prune(joint, n)
-    for q in range(n_live):
-        n_live = split(p, q, n_live, number, n_open, joint, n, grid[0], grid[1], grid[2])
-    return n_live
 
 
 @inlined
@@ -323,7 +345,8 @@ def _couple(
     for k in range(n):
         out[k] /= total + none
     out[n] = none / (total + none)
-    return settled(out, 0, n + 1)
+    leave_out_none(out, n + 1)
+    return only_possible(out, 0, n + 1)
 
 
 @inlined

@@ -32,6 +32,7 @@ from mbagent.models.graphs.units import (
     shown,
     unit_values,
 )
+from mbagent.models.particles import NEGLIGIBLE
 from mbagent.transitions import TransitionBatch
 
 Bools: TypeAlias = NDArray[np.bool_]
@@ -64,6 +65,13 @@ class Fitted:
     has_event: bool
     asked: Sequence[Question]
     found: Sequence[Search]
+
+
+def for_planning(fitted: Fitted) -> Fitted:
+    """The graphs as planners read them: what no observation stands behind is no outcome, all else is one, however rare."""
+    noise = np.full(1, NEGLIGIBLE)
+    usual, late, event = (graphs._replace(noise=noise) for graphs in (fitted.usual, fitted.late, fitted.event))
+    return replace(fitted, usual=usual, late=late, event=event)
 
 
 class _Table:

@@ -161,6 +161,7 @@ class _Board:
             np.concatenate([[0], np.cumsum(layout.outputs)]).astype(np.int64),
             np.concatenate([graphs.base[graphs.start[c] : graphs.start[c + 1]] for c in channel_of]),
             graphs.still,
+            graphs.noise,
         )
 
     def _add(self, column: int, off: int, on: int, leaf: int = -1) -> int:

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.graphs.acts import Acts
-from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, distributions, n_columns, show
-from mbagent.models.graphs.draws import settled
+from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, distributions, n_columns, show, with_rest, without_noise
+from mbagent.models.graphs.draws import only_possible
 from mbagent.models.graphs.ending import end_graph
 from mbagent.models.graphs.units import Layout
 from mbagent_envs._compiled import compiled, inlined
@@ -24,9 +24,6 @@ Words: TypeAlias = NDArray[np.uint64]
 
 MOST_WORDS = 4_000_000
 """Words of a table for each action; where they would be more, one table serves all actions."""
-
-RARE = 1e-3
-"""Bits of a coupling whose usual rate is lower are left out where nothing touches them."""
 
 FIRST, MEMBERS, OUTPUTS, START, PAIR, COUPLING = range(6)
 """Columns of ``Lean.units``."""
@@ -46,6 +43,7 @@ class Lean(NamedTuple):
         habit: of each pair, how often it stays and how probable novelties are, [pairs, 2].
         base: where novelties are drawn from, [sum of cardinalities].
         still: probability that a unit without graphs changes, [1].
+        noise: see ``compiled.Graphs``.
         exactly: of the couplings, bool [Q].
         row: where each factor's values begin among the rows, int64 [F + 1].
         shown: where each factor's columns begin, int64 [F + 1].
@@ -68,6 +66,7 @@ class Lean(NamedTuple):
     habit: Floats
     base: Floats
     still: Floats
+    noise: Floats
     exactly: Bools
     row: Ints
     shown: Ints
@@ -94,7 +93,7 @@ def lean(layout: Layout, graphs: Graphs, late: Graphs, cardinalities: tuple[int,
 
     Args:
         layout: the units.
-        graphs: of all of them.
+        graphs: of all of them, for planning.
         late: of none, or of the end alone.
         cardinalities: number of values of each factor, length F.
     """
@@ -114,6 +113,7 @@ def lean(layout: Layout, graphs: Graphs, late: Graphs, cardinalities: tuple[int,
         habit=np.stack([graphs.stays, graphs.novelty], axis=1),
         base=graphs.base,
         still=graphs.still,
+        noise=graphs.noise,
         exactly=layout.exactly,
         row=row,
         shown=shown,
@@ -168,9 +168,9 @@ def _usual(layout: Layout, graphs: Graphs, nothing: Ints, on: Bools, always: Wor
         for unit in graphs.changing:
             start = graphs.start[unit]
             if layout.coupling_of[unit] >= 0:
-                active = rates[start + 1] >= RARE
+                active = rates[start + 1] > 0.0
             else:
-                active = settled(rates, start, layout.outputs[unit]) != 0
+                active = only_possible(rates, start, layout.outputs[unit]) != 0
             if active:
                 set_bit(always[action], unit)
 
@@ -296,6 +296,7 @@ def rates_of(
     habit: Floats,
     base: Floats,
     still: Floats,
+    noise: float,
     values: Ints,
     out: Floats,
 ) -> None:
@@ -306,24 +307,21 @@ def rates_of(
         values[i] = value
         pair = units[unit, PAIR] + way * n + value
         begins, ends = entries[pair], entries[pair + 1]
-        total, slack = 0.0, 0.0
+        total, slack, asked = 0.0, 0.0, False
         for k in range(start, start + n):
             out[k] = 0.0
         for e in range(begins, ends):
             node = entry[e, 1]
+            asked |= nodes[node, 0] >= 0
             while nodes[node, 0] >= 0:  # without a branch, which a processor could not foresee
                 node = nodes[node, 1 + np.int64(on[nodes[node, 0]])]
-            out[start + entry[e, 0]] = leaf[node, 0]
-            total += leaf[node, 0]
+            rate = without_noise(leaf[node, 0], leaf[node, 1], n, noise)
+            out[start + entry[e, 0]] = rate
+            total += abs(rate)
             slack += 3.0 * leaf[node, 1]
         if n == 2:
-            rate = out[start + 1] if ends > begins else still[0] if value == 0 else 1.0 - still[0]
+            usual = still[0] if still[0] >= noise else 0.0
+            rate = out[start + 1] if ends > begins else usual if value == 0 else 1.0 - usual
             out[start], out[start + 1] = 1.0 - rate, rate
             continue
-        stay = 1.0 - total
-        if ends > begins:
-            stay = max(0.0, stay - slack) if habit[pair, 0] == 0.0 else max(stay, min(slack, habit[pair, 0]))
-        out[start + value] = stay
-        scale = (1.0 - habit[pair, 1]) / (total + stay)
-        for k in range(start, start + n):
-            out[k] = out[k] * scale + habit[pair, 1] * base[k]
+        with_rest(out, base, start, n, value, total, slack, habit[pair, 0], habit[pair, 1], ends > begins, asked, noise)

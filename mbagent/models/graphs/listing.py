@@ -1,58 +1,86 @@
-"""Successors for planning, compiled: systematic draws through the inverse distribution function (see ``systematic.py``).
+"""Successors for planning, compiled; see ``particles.py``.
 
 Shapes: B rows, F factors, U units (the last two are ``terminated`` and the event), Q couplings.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.base import Successors
 from mbagent.models.graphs.compiled import Graphs, Ints, distributions, show, show_next, show_next_meetings, write
-from mbagent.models.graphs.couplings import couple, settle
-from mbagent.models.graphs.draws import Work, alone, is_late, settled, work_space
+from mbagent.models.graphs.couplings import couple, leave_out_none, settle
+from mbagent.models.graphs.draws import Work, alone, is_late, only_possible, work_space
 from mbagent.models.graphs.units import Layout
-from mbagent.models.particles import Found, Particles, begin, new_particles, prune, room, split, used
+from mbagent.models.particles import (
+    MAIN,
+    MASS,
+    STRATA,
+    Found,
+    Grid,
+    Particles,
+    begin,
+    n_outcomes,
+    n_possible,
+    new_particles,
+    room,
+    share_out,
+    slot_of,
+    used,
+    weigh,
+)
 from mbagent_envs._compiled import compiled
 
 
 @compiled
-def successors(
-    states: Ints, actions: Ints, layout: Layout, graphs: Graphs, late: Graphs, n_grid: int, key: np.uint64, offset: float
-) -> Found:
-    """The outcomes of each row that ``n_grid`` points find, unit after unit."""
-    w, n_units = work_space(layout, graphs, late), len(layout.outputs)
+def successors(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, late: Graphs, grid: Grid) -> Found:
+    """The outcomes of each row, unit after unit; see ``particles.py``. The graphs must be those for planning."""
+    w, n_units, n_grid = work_space(layout, graphs, late), len(layout.outputs), grid[0]
     single = alone(layout, graphs, w.later)
     early = np.concatenate((single[single < n_units - 1], n_units + np.arange(len(layout.exactly))))
     width = n_units + len(layout.exactly)
-    p, found = new_particles(n_grid, width), room(len(states), n_grid, states.shape[1] + 1)
+    p, found = new_particles(n_grid, width, len(w.joint)), room(len(states), n_grid, states.shape[1] + 1)
     still_open, base = np.empty(width, dtype=np.int64), np.empty(states.shape[1], dtype=np.int64)
     total = 0
     for b in range(len(states)):
         show(states[b], actions[b], layout, w.on)
         distributions(graphs.changing, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
         base[:] = states[b]
-        n_live, n_open, ended = begin(p, n_grid), 0, False
+        n_open, ended = 0, False
+        begin(p, n_grid, _fits(early, states[b], layout, graphs, late, w, n_grid))
         for number in early:
             n, value = _distribution(number, states[b], layout, graphs, w)
-            best = settled(w.joint, 0, n)
+            best = only_possible(w.joint, 0, n)
             if best >= 0:
                 if best != value:
                     ended = _put(base, number, best, layout, ended)
                 continue
-            prune(w.joint, n)
             still_open[n_open] = number
-            for q in range(n_live):
-                n_live = split(p, q, n_live, number, n_open, w.joint, n, n_grid, key, offset)
+            share_out(p, -1, number, n_open, w.joint, n, number == n_units - 2, grid)
             n_open += 1
         if len(late.changing):
-            n_live, n_open = _split_late(
-                p, n_live, n_open, states[b], actions[b], base, still_open, ended, layout, graphs, late, w, n_grid, key, offset
-            )
-        _list(p, n_live, n_open, base, still_open, ended, layout, found, b, total)
-        total += n_live
+            n_open = _split_late(p, n_open, states[b], actions[b], base, still_open, ended, layout, graphs, late, w, grid)
+        _list(p, n_open, base, still_open, ended, layout, found, b, total, n_grid)
+        total += found[0][b]
     return used(found, total)
+
+
+@compiled
+def _fits(early: Ints, state: Ints, layout: Layout, graphs: Graphs, late: Graphs, w: Work, n_grid: int) -> bool:
+    """Whether all outcomes of a row can be listed."""
+    possible = 1
+    for number in early:
+        n, _ = _distribution(number, state, layout, graphs, w)
+        possible *= n_possible(w.joint, 0, n)
+        if possible > n_grid:
+            return False
+    for unit in late.changing:
+        possible *= layout.outputs[unit]
+    return bool(possible <= 2 * n_grid)
 
 
 @compiled
@@ -60,7 +88,9 @@ def _distribution(number: int, state: Ints, layout: Layout, graphs: Graphs, w: W
     """Writes the distribution of a unit, or of a coupling, to ``w.joint``; returns its size and the present value or -1."""
     n_units = len(layout.outputs)
     if number >= n_units:
-        return couple(number - n_units, state, w.rates, w.still, layout, graphs, w.joint) + 1, -1
+        n = couple(number - n_units, state, w.rates, w.still, layout, graphs, w.joint) + 1
+        leave_out_none(w.joint, n)
+        return n, -1
     n, start = layout.outputs[number], graphs.start[number]
     w.joint[:n] = w.rates[start : start + n]
     return n, w.values[number]
@@ -69,7 +99,6 @@ def _distribution(number: int, state: Ints, layout: Layout, graphs: Graphs, w: W
 @compiled
 def _split_late(
     p: Particles,
-    n_live: int,
     n_open: int,
     state: Ints,
     action: int,
@@ -80,36 +109,36 @@ def _split_late(
     graphs: Graphs,
     late: Graphs,
     w: Work,
-    n_grid: int,
-    key: np.uint64,
-    offset: float,
-) -> tuple[int, int]:
-    """Draws the late units, each given what the particle became so far; returns how many particles and open units there are."""
-    following = np.empty_like(base)
+    grid: Grid,
+) -> int:
+    """Draws the late units, each given what the particle became so far; returns how many open units there are."""
+    following, end = np.empty_like(base), len(layout.outputs) - 2
     for i in range(len(late.changing)):
         number = late.changing[i]
         n, start = layout.outputs[number], late.start[number]
+        still_open[n_open] = number
         if not is_late(number, w.rates, layout, graphs):
-            _put(base, number, settled(w.rates, start, n), layout, False)
+            w.joint[:n] = w.rates[start : start + n]
+            share_out(p, -1, number, n_open, w.joint, n, number == end, grid)
+            n_open += 1
             continue
-        for q in range(n_live):
-            _fill(following, base, p, q, still_open, n_open, layout, ended)
+        n_main, n_strata = p.state[MAIN], p.state[STRATA]
+        for j in range(n_main + n_strata):
+            slot = grid[0] + j if j < n_strata else j - n_strata  # strata first
+            _fill(following, base, p, slot, still_open, n_open, layout, ended)
             show_next(following, layout, w.on)
-            if number == len(layout.outputs) - 2:
+            if number == end:
                 show_next_meetings(following, layout, w.on)
             distributions(late.changing[i : i + 1], state, action, layout, late, w.on, w.values, w.rates)
             w.joint[:n] = w.rates[start : start + n]
-            prune(w.joint, n)
-            n_live = split(p, q, n_live, number, n_open, w.joint, n, n_grid, key, offset)
-        still_open[n_open] = number
+            share_out(p, slot, number, n_open, w.joint, n, number == end, grid)
         n_open += 1
-    return n_live, n_open
+    return n_open
 
 
 @compiled
 def _list(
     p: Particles,
-    n_live: int,
     n_open: int,
     base: Ints,
     still_open: Ints,
@@ -118,22 +147,26 @@ def _list(
     found: Found,
     b: int,
     total: int,
+    n_grid: int,
 ) -> None:
     """Writes the outcomes of row b from number ``total`` on."""
-    counts, following, terminated, mass, points = found
-    counts[b] = n_live
-    for q in range(n_live):
-        terminated[total + q] = _fill(following[total + q], base, p, q, still_open, n_open, layout, ended)
-        mass[total + q], points[total + q] = p.mass[q], p.points[q]
+    counts, following, terminated, probabilities, left = found
+    weigh(p, n_grid)
+    left[b] = p.left[0]
+    counts[b] = n_outcomes(p)
+    for i in range(counts[b]):
+        slot = slot_of(p, i, n_grid)
+        terminated[total + i] = _fill(following[total + i], base, p, slot, still_open, n_open, layout, ended)
+        probabilities[total + i] = p.chances[slot, MASS]
 
 
 @compiled
-def _fill(state: Ints, base: Ints, p: Particles, q: int, still_open: Ints, n_open: int, layout: Layout, ended: bool) -> bool:
+def _fill(state: Ints, base: Ints, p: Particles, slot: int, still_open: Ints, n_open: int, layout: Layout, ended: bool) -> bool:
     """Writes the next state that a particle stands for; returns whether the episode is over."""
     state[:] = base
     over = ended
     for v in range(n_open):
-        over = _put(state, still_open[v], p.factors[q, v], layout, over)
+        over = _put(state, still_open[v], p.factors[slot, v], layout, over)
     return over
 
 
@@ -150,17 +183,19 @@ def _put(state: Ints, number: int, value: int, layout: Layout, ended: bool) -> b
     return ended
 
 
-def mixed(usual: Successors, event: Successors, happens: NDArray[np.int64], rates: NDArray[np.float64]) -> Successors:
-    """Both kinds of successors; row ``happens[j]`` of ``usual`` is row j of ``event``, which has the share ``rates`` of it."""
-    rows = np.concatenate([usual.rows, happens[event.rows]])
-    share = rates.copy()
-    share[np.setdiff1d(np.arange(len(rates)), happens)] = 0.0
-    weights = np.concatenate([usual.probabilities * (1.0 - share)[usual.rows], event.probabilities * share[happens[event.rows]]])
-    kept = weights > 0.0
-    order = np.argsort(rows[kept], kind="stable")
-    index = np.flatnonzero(kept)[order]
-    states = np.concatenate([usual.states, event.states])[index]
-    terminated = np.concatenate([usual.terminated, event.terminated])[index]
-    counts = np.bincount(rows[index], minlength=len(rates))
+@compiled
+def event_draws(rate: float, n_grid: int) -> int:
+    """Of ``n_grid`` draws, those that go to the rare event: its share, but one at least where it can happen at all."""
+    return 0 if rate <= 0.0 else max(1, min(n_grid, math.ceil(rate * n_grid)))
+
+
+def mixed(parts: Sequence[tuple[NDArray[np.int64], NDArray[np.float64], Successors]], n_rows: int) -> Successors:
+    """Several kinds of successors of the same rows: of each, which rows [b] it is of, its share of them [b], and what follows."""
+    rows = np.concatenate([which[found.rows] for which, _, found in parts])
+    weights = np.concatenate([found.probabilities * share[found.rows] for _, share, found in parts])
+    order = np.argsort(rows, kind="stable")
+    states = np.concatenate([found.states for _, _, found in parts])[order]
+    terminated = np.concatenate([found.terminated for _, _, found in parts])[order]
+    counts = np.bincount(rows, minlength=n_rows)
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    return Successors(offsets, states, terminated, weights[index])
+    return Successors(offsets, states, terminated, weights[order])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mbagent.models.base import Bools, FitReport, Floats
 from mbagent.models.fit_report import Variable
-from mbagent.models.graphs.arrays import from_arrays, table_of, to_arrays
+from mbagent.models.graphs.arrays import SAVED, from_arrays, table_of, to_arrays
 from mbagent.models.graphs.channels import find_couplings, learn_channels, learn_late
 from mbagent.models.graphs.compiled import Graphs, build
 from mbagent.models.graphs.evidence import Ints
@@ -249,7 +249,7 @@ class LocalGraphModel(DecisionGraphModel):
         Raises:
             ValueError: the arrays are not those of a model of these planes and actions; nothing is changed then.
         """
-        graph_parts = {f"{name}.{part}" for name in ("local", "late") for part in Graphs._fields}
+        graph_parts = {f"{name}.{part}" for name in ("local", "late") for part in SAVED}
         wrong = sorted(({"reach", "couplings", "counts", "met"} | graph_parts) ^ set(state))
         if wrong:
             raise ValueError(f"These weights are not those of local decision graphs (first difference: {wrong[0]!r}).")
@@ -260,7 +260,7 @@ class LocalGraphModel(DecisionGraphModel):
         columns = relative_columns(cards, self.parts, reach)
         graphs, late = (
             from_arrays(
-                {part: state[f"{name}.{part}"] for part in Graphs._fields},
+                {part: state[f"{name}.{part}"] for part in SAVED},
                 channel_layout(cards, self.acts),
                 len(columns),
             )

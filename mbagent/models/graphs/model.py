@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from mbagent.models.base import Bools, FitReport, Floats
 from mbagent.models.fit_report import Variable, VariableReport, describe
 from mbagent.models.graphs.acts import acts_of
-from mbagent.models.graphs.arrays import from_arrays, table_of, to_arrays
-from mbagent.models.graphs.compiled import Graphs, build, n_columns
+from mbagent.models.graphs.arrays import SAVED, from_arrays, table_of, to_arrays
+from mbagent.models.graphs.compiled import build, n_columns
 from mbagent.models.graphs.conditioner import AT_ONCE
 from mbagent.models.graphs.events import flag_events
 from mbagent.models.graphs.exclusive import find_groups
@@ -314,7 +314,7 @@ class DecisionGraphModel(GraphPredictions):
             "groups",
             "couplings",
             "has_event",
-            *(f"{name}.{part}" for name in ("usual", "late", "event") for part in Graphs._fields),
+            *(f"{name}.{part}" for name in ("usual", "late", "event") for part in SAVED),
         }
         wrong = sorted(known ^ set(state))
         if wrong:
@@ -337,7 +337,7 @@ class DecisionGraphModel(GraphPredictions):
         layout = coupled_layout(layout, [coupled[couplings[coupled] == q] for q in np.unique(couplings[coupled])])
         now, both = n_columns(layout), n_columns(layout) + len(layout.factor)
         usual, late, event = (
-            from_arrays({part: state[f"{name}.{part}"] for part in Graphs._fields}, layout, n)
+            from_arrays({part: state[f"{name}.{part}"] for part in SAVED}, layout, n)
             for name, n in (("usual", now), ("late", both), ("event", now))
         )
         self.fitted = Fitted(layout, usual, late, event, bool(np.any(state["has_event"])), (), ())

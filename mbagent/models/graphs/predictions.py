@@ -17,10 +17,10 @@ from mbagent.models.base import (
 )
 from mbagent.models.graphs import draws
 from mbagent.models.graphs.compiled import Graphs, Ints
-from mbagent.models.graphs.fitting import Fitted, nothing_late
+from mbagent.models.graphs.fitting import Fitted, for_planning, nothing_late
 from mbagent.models.graphs.laws import COVERING, MOST_TRIES, Laws, all_kept, kept_chances, lawful
 from mbagent.models.graphs.lean import Lean
-from mbagent.models.graphs.listing import mixed, successors
+from mbagent.models.graphs.listing import event_draws, mixed, successors
 from mbagent.models.graphs.whole import WholeKernel, kernel_of
 from mbagent.models.particles import assemble, rows_at_once, start
 from mbagent_envs.random_keys import derive, uniforms
@@ -40,13 +40,19 @@ class GraphPredictions(BaseTransitionModel):
     """
 
     fitted: Fitted
+    _planned: tuple[Fitted, Fitted] | None = None
     _kernel: tuple[Fitted, Lean | WholeKernel] | None = None
 
     def kernel(self) -> Lean | WholeKernel:
         """The graphs for compiled search, see ``compiled_model.py``."""
         if self._kernel is None or self._kernel[0] is not self.fitted:
-            self._kernel = self.fitted, kernel_of(self.fitted, self.cardinalities)
+            self._kernel = self.fitted, kernel_of(self._for_planning(), self.cardinalities)
         return self._kernel[1]
+
+    def _for_planning(self) -> Fitted:
+        if self._planned is None or self._planned[0] is not self.fitted:
+            self._planned = self.fitted, for_planning(self.fitted)
+        return self._planned[1]
 
     @property
     def _laws(self) -> Laws:
@@ -126,7 +132,8 @@ class GraphPredictions(BaseTransitionModel):
         layout = self.fitted.layout
         usual: Floats = draws.log_prob(states, actions, following, over, layout, self.fitted.usual, self.fitted.late)
         if not self._laws.none:
-            found = self._successors(states, actions, self.fitted.usual, self.fitted.late, COVERING, 0)
+            planned = self._for_planning()
+            found = self._successors(states, actions, planned.usual, planned.late, COVERING, 0)
             kept = all_kept(*self._laws, *self._cells, states, following)
             chances = kept_chances(self._laws, *self._cells, states, found)
             usual[~over] = np.where(kept, usual - np.log(chances), -np.inf)[~over]
@@ -138,16 +145,23 @@ class GraphPredictions(BaseTransitionModel):
             return np.logaddexp(np.log1p(-rate) + usual, np.log(rate) + event)
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
-        """See TransitionModel; systematic draws, see ``models/systematic.py``."""
+        """See TransitionModel; see ``models/particles.py``."""
         states, actions = self._rows(states, actions)
-        usual = self._successors(states, actions, self.fitted.usual, self.fitted.late, n_samples, seed)
-        rates = self._event_rates(states, actions)
-        happens = np.flatnonzero(rates >= 1.0 / n_samples)
-        if len(happens) == 0:
+        planned = self._for_planning()
+        if not self.fitted.has_event:
+            usual = self._successors(states, actions, planned.usual, planned.late, n_samples, seed)
             return lawful(self._laws, *self._cells, states, usual)
-        late = nothing_late(self.fitted.event)
-        event = self._successors(states[happens], actions[happens], self.fitted.event, late, n_samples, seed)
-        return mixed(usual, event, happens, rates)
+        rates: Floats = draws.event_rates(states, actions, planned.layout, planned.usual)
+        n_events = np.array([event_draws(rate, n_samples) for rate in rates], dtype=np.int64)
+        parts, late = [], nothing_late(planned.event)
+        for n in np.unique(n_events):
+            some = np.flatnonzero((n_events == n) & (rates < 1.0))
+            found = self._successors(states[some], actions[some], planned.usual, planned.late, max(1, n_samples - int(n)), seed)
+            parts.append((some, 1.0 - rates[some], found))
+            some = np.flatnonzero((n_events == n) & (rates > 0.0))
+            found = self._successors(states[some], actions[some], planned.event, late, int(n), seed)
+            parts.append((some, rates[some], found))
+        return mixed(parts, len(states))
 
     def _successors(
         self, states: States, actions: Actions, graphs: Graphs, late: Graphs, n_samples: int, seed: int
@@ -156,7 +170,7 @@ class GraphPredictions(BaseTransitionModel):
         layout, n_outputs = self.fitted.layout, states.shape[1] + 1
         step = rows_at_once(n_samples, n_outputs)
         parts = [
-            successors(states[b : b + step], actions[b : b + step], layout, graphs, late, n_samples, key, offset)
+            successors(states[b : b + step], actions[b : b + step], layout, graphs, late, (n_samples, key, offset))
             for b in range(0, len(states), step)
         ]
-        return assemble(parts, n_samples, n_outputs)
+        return assemble(parts, n_outputs)

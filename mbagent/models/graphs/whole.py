@@ -13,9 +13,8 @@ from mbagent.models.graphs.ending import ends_late_only
 from mbagent.models.graphs.fitting import Fitted, nothing_late
 from mbagent.models.graphs.laws import leave_out
 from mbagent.models.graphs.lean import Lean, lean
-from mbagent.models.graphs.listing import successors
+from mbagent.models.graphs.listing import event_draws, successors
 from mbagent.models.graphs.units import Layout
-from mbagent.models.particles import FOUND
 from mbagent_envs._compiled import compiled
 
 
@@ -23,7 +22,7 @@ class WholeKernel(NamedTuple):
     """Decision graphs for compiled search, where some units are drawn late, or rare events happen.
 
     Attributes:
-        layout, usual, late, event: see ``fitting.Fitted``.
+        layout, usual, late, event: see ``fitting.Fitted``; for planning.
         event_late: graphs of nothing.
         has_event: whether there are rare events.
     """
@@ -37,7 +36,7 @@ class WholeKernel(NamedTuple):
 
 
 def kernel_of(fitted: Fitted, cardinalities: tuple[int, ...]) -> Lean | WholeKernel:
-    """The kernel of fitted graphs: the lean one where it says everything."""
+    """The kernel of fitted graphs for planning: the lean one where it says everything."""
     if not fitted.has_event and ends_late_only(fitted.layout, fitted.late):
         return lean(fitted.layout, fitted.usual, fitted.late, cardinalities)
     none = nothing_late(fitted.event)
@@ -52,7 +51,7 @@ class WholeWork(NamedTuple):
         values: of the units, int64 [U].
         rates: their distributions, [sum of cardinalities].
         actions: int64 [A].
-        states: int64 [A, F].
+        states: int64 [1, F].
         event: number of the event's unit, int64 [1].
     """
 
@@ -74,7 +73,7 @@ def whole_work(kernel: WholeKernel, n_grid: int) -> WholeWork:
         np.empty(len(layout.outputs), dtype=np.int64),
         np.empty(kernel.usual.start[-1], dtype=np.float64),
         np.arange(len(layout.acts.way)),
-        np.empty((len(layout.acts.way), layout.n_factors), dtype=np.int64),
+        np.empty((1, layout.n_factors), dtype=np.int64),
         np.array([len(layout.outputs) - 1]),
     )
 
@@ -87,31 +86,23 @@ def whole_outcomes(
     """See compiled_model; every unit is asked."""
     layout, graphs, states, actions, total = kernel.layout, kernel.usual, work.states, work.actions, 0
     states[:] = state
-    found = successors(states, actions, layout, graphs, kernel.late, n_grid, key, offset)
-    begins = 0
     for action in range(len(layout.acts.way)):
-        rate = 0.0
+        rate, a = 0.0, action
         if kernel.has_event:
             show(state, action, layout, work.on)
             distributions(work.event, state, action, layout, graphs, work.on, work.values, work.rates)
             rate = work.rates[graphs.start[-1] - 1]
-        rate = rate if rate * n_grid >= 1.0 else 0.0
-        ends = begins + found[0][action]
-        n = _take(
-            found[1][begins:ends],
-            found[2][begins:ends],
-            found[3][begins:ends],
-            found[4][begins:ends],
-            1.0 - rate,
-            n_grid,
-            total,
-            out,
-        )
-        begins = ends
+        draws, n, out.left_out[action] = event_draws(rate, n_grid), 0, 0.0
+        if rate < 1.0:
+            grid = (max(1, n_grid - draws), key, offset)
+            found = successors(states[:1], actions[a : a + 1], layout, graphs, kernel.late, grid)
+            n = _take(found[1], found[2], found[3], 1.0 - rate, total, out)
+            out.left_out[action] += (1.0 - rate) * found[4][0]
         if rate > 0.0:
-            a = action
-            rare = successors(states[:1], actions[a : a + 1], layout, kernel.event, kernel.event_late, n_grid, key, offset)
-            n += _take(rare[1], rare[2], rare[3], rare[4], rate, n_grid, total + n, out)
+            grid = (draws, key, offset)
+            found = successors(states[:1], actions[a : a + 1], layout, kernel.event, kernel.event_late, grid)
+            n += _take(found[1], found[2], found[3], rate, total + n, out)
+            out.left_out[action] += rate * found[4][0]
         if len(layout.counts) or len(layout.met):
             n = _leave_out(layout, state, total, n, out)
         out.counts[action] = n
@@ -127,15 +118,10 @@ def _leave_out(layout: Layout, state: Ints, first: int, n: int, out: Outcomes) -
 
 
 @compiled
-def _take(
-    states: Ints, terminated: Bools, mass: Floats, points: Ints, share: float, n_grid: int, total: int, out: Outcomes
-) -> int:
+def _take(states: Ints, terminated: Bools, probabilities: Floats, share: float, total: int, out: Outcomes) -> int:
     """Takes outcomes over, from number ``total`` on, which have a share of all; returns how many."""
-    if share <= 0.0:
-        return 0
-    everything = mass.sum()
     for q in range(len(states)):
         out.states[total + q] = states[q]
         out.terminated[total + q] = terminated[q]
-        out.probabilities[total + q] = share * (mass[q] / everything if everything >= FOUND else points[q] / n_grid)
+        out.probabilities[total + q] = share * probabilities[q]
     return len(states)
