@@ -119,13 +119,22 @@ def test_the_file_holds_json_and_plain_arrays_only(agent: ModelLearningAgent) ->
 
 
 def test_a_file_with_code_in_it_is_refused_by_the_entrys_name(tmp_path: Path) -> None:
-    PPO("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8).save(tmp_path / "ppo.zip")
+    with zipfile.ZipFile(tmp_path / "pickle.zip", "w") as archive:
+        archive.writestr("data", json.dumps({"format": persistence.FORMAT}))
+        archive.writestr("policy.pth", b"")
     with pytest.raises(ValueError, match=r"\.pth.*pickle"):
-        ModelLearningAgent.load(tmp_path / "ppo.zip")
+        ModelLearningAgent.load(tmp_path / "pickle.zip")
     with zipfile.ZipFile(tmp_path / "evil.zip", "w") as archive:
         archive.writestr("data", json.dumps({"settings": {":type:": "x", ":serialized:": "gASV"}}))
     with pytest.raises(ValueError, match="'settings'"):
         ModelLearningAgent.load(tmp_path / "evil.zip")
+
+
+def test_a_file_of_another_algorithm_is_told_to_be_one(agent: ModelLearningAgent, tmp_path: Path) -> None:
+    PPO("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8).save(tmp_path / "ppo.zip")
+    for load in (ModelLearningAgent.load, agent.set_parameters):
+        with pytest.raises(ValueError, match=r"ppo\.zip was saved by another .* algorithm.*PPO\.load"):
+            load(str(tmp_path / "ppo.zip"))
 
 
 def test_missing_and_damaged_files_are_told_apart(tmp_path: Path) -> None:
