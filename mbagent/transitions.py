@@ -309,7 +309,7 @@ def _begun(folder: Path, cardinalities: tuple[int, ...], n_actions: int, kind: n
             f"{folder} cannot hold transitions of {len(cardinalities)} factors; give a folder, and a factor at least."
         )
     if not (folder / _ABOUT).exists():
-        folder.mkdir(parents=True, exist_ok=True)
+        Path(os.path.realpath(folder)).mkdir(parents=True, exist_ok=True)  # also where a link points to nothing yet
         for name in _COLUMNS:
             (folder / f"{name}.bin").touch()
         with _locked(folder):

@@ -214,6 +214,9 @@ def test_symbolic_links_stay_and_what_they_point_to_is_written(tmp_path: Path) -
         assert (tmp_path / name).is_symlink()
         assert (tmp_path / "there" / name).read_text() == "new"
     assert {path.name for path in tmp_path.rglob("*")} == {"there", "old", "dangling"}
+    (tmp_path / "rows").symlink_to(Path("there") / "rows")
+    TransitionDataset(CARDINALITIES, 4, tmp_path / "rows").append(batch(30))
+    assert folder_rows(tmp_path / "there" / "rows") == 30
 
 
 def test_permissions_are_those_of_a_new_file_or_of_the_one_replaced(tmp_path: Path) -> None:

@@ -58,6 +58,15 @@ def test_a_loaded_agent_learns_on(agent: ModelLearningAgent, tmp_path: Path) -> 
     assert len(loaded.transitions) == 3200
 
 
+def test_transitions_are_included_by_name_or_in_a_list(agent: ModelLearningAgent, tmp_path: Path) -> None:
+    agent.save(tmp_path / "agent", include="transitions")
+    assert len(ModelLearningAgent.load(tmp_path / "agent", env=gym.make(GEYSER, hit_cost=5.0)).transitions) == 3000
+    for wrong in ("replay", ["transitions", "replay"]):
+        with pytest.raises(ValueError, match="takes 'transitions' only, got 'replay'"):
+            agent.save(tmp_path / "other", include=wrong)
+    assert not (tmp_path / "other.zip").exists()
+
+
 def test_learning_on_without_the_transitions_is_warned_of(agent: ModelLearningAgent, tmp_path: Path) -> None:
     agent.save(tmp_path / "agent")
     loaded = ModelLearningAgent.load(tmp_path / "agent", env=gym.make(GEYSER, hit_cost=5.0))
@@ -173,9 +182,9 @@ def test_spaces_survive_json(space: spaces.Space[Any]) -> None:
 
 
 def test_transitions_travel_in_plain_files(agent: ModelLearningAgent, tmp_path: Path) -> None:
-    agent.save_transitions(str(tmp_path / "seen.npz"))
+    agent.save_transitions(str(tmp_path / "seen"))
     other = ModelLearningAgent("MctsPolicy", gym.make(GEYSER), seed=3)
-    other.load_transitions(str(tmp_path / "seen.npz"))
+    other.load_transitions(str(tmp_path / "seen"))
     np.testing.assert_array_equal(other.transitions.rows().next_states, agent.transitions.rows().next_states)
     with pytest.raises(ValueError, match="another environment"):
         ModelLearningAgent("MctsPolicy", Corridor()).load_transitions(str(tmp_path / "seen.npz"))
