@@ -251,7 +251,7 @@ class TransitionDataset:
             TypeError: ``path`` is none of these.
             ValueError: the file, or what is in the folder, is not such a table.
         """
-        if isinstance(path, str | os.PathLike) and Path(path).is_dir() and not Path(f"{os.fspath(path)}.npz").is_file():
+        if path and isinstance(path, str | os.PathLike) and Path(path).is_dir() and not Path(f"{os.fspath(path)}.npz").is_file():
             about = _about(Path(path))
             return cls(tuple(about["cardinalities"]), about["n_actions"], path)
         cardinalities, n_actions, rows = _table(path)

@@ -24,7 +24,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import gymnasium as gym
 import numpy as np
@@ -37,7 +37,7 @@ from mbagent.transitions import TransitionBatch, TransitionDataset
 
 GAME = "mbagent/FlierCatcher-v0"
 N_FACTORS = 120
-METHOD: Literal["forkserver", "fork"] = "forkserver"
+METHOD = "forkserver"
 """How processes are started: from a server that has imported everything already."""
 Subject: TypeAlias = Literal["save", "save_transitions", "folder"]
 
@@ -155,7 +155,7 @@ def keep_saving(subject: Subject, path: Path, first: int, n: int, told: Connecti
 def start(subject: Subject, path: Path, first: int, n: int, most: int = sys.maxsize) -> tuple[BaseProcess, Connection]:
     """A process that saves, and where it tells of what it has saved."""
     told, tell = multiprocessing.Pipe(duplex=False)
-    context = multiprocessing.get_context(METHOD)
+    context: Any = multiprocessing.get_context(METHOD)
     process = context.Process(target=keep_saving, args=(subject, path, first, n, tell, most))
     process.start()
     tell.close()

@@ -291,7 +291,7 @@ def test_no_path_at_all_is_told_in_one_sentence(act: Callable[[Any], None]) -> N
     for wrong in (None, 3):
         with pytest.raises(TypeError, match="a path or an open binary file, got"):
             act(wrong)
-    with pytest.raises(ValueError, match=r"must name a file, got ''|is no folder of transitions"):
+    with pytest.raises(ValueError, match="must name a file, got ''"):
         act("")
 
 
