@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -17,9 +16,10 @@ import stable_baselines3
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-FORMAT = "mbagent-agent-1"
+from mbagent import files
+from mbagent.files import Target
 
-Target = str | os.PathLike[str] | BinaryIO
+FORMAT = "mbagent-agent-1"
 
 
 def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
@@ -84,6 +84,9 @@ def write(target: Target, data: Mapping[str, Any], arrays: Mapping[str, Mapping[
     """Writes a zip with ``data`` as JSON and each group of ``arrays`` as an ``.npz`` of its own.
 
     A path without suffix gets ``.zip``, as in SB3; missing folders are made. The file is complete or not there.
+
+    Raises:
+        TypeError, ValueError, OSError: see ``files.writing``.
     """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", compression=zipfile.ZIP_DEFLATED) as archive:
@@ -94,15 +97,8 @@ def write(target: Target, data: Mapping[str, Any], arrays: Mapping[str, Mapping[
             archive.writestr(f"{name}.npz", part.getvalue())
         archive.writestr("_stable_baselines3_version", stable_baselines3.__version__)
         archive.writestr("system_info.txt", f"- Gymnasium: {gym.__version__}\n- Numpy: {np.__version__}\n")
-    if not isinstance(target, str | os.PathLike):
-        target.write(buffer.getvalue())
-        return
-    path = Path(target)
-    path = path if path.suffix else path.with_suffix(".zip")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_bytes(buffer.getvalue())
-    temporary.replace(path)
+    with files.writing(target, ".zip", always=False) as file:
+        file.write(buffer.getbuffer())
 
 
 def read(source: Target) -> tuple[dict[str, Any], dict[str, dict[str, NDArray[Any]]]]:
@@ -110,25 +106,27 @@ def read(source: Target) -> tuple[dict[str, Any], dict[str, dict[str, NDArray[An
 
     Raises:
         FileNotFoundError: there is no such file.
+        TypeError: ``source`` is neither a path nor an open binary file.
         ValueError: the file is of another kind, or holds serialized code; the message names the entry.
     """
-    if isinstance(source, str | os.PathLike):
-        path = Path(source)
-        source = path if path.is_file() or path.suffix else path.with_suffix(".zip")
-        if not Path(source).is_file():
-            raise FileNotFoundError(f"There is no file {source}; save an agent there first.")
-    elif not hasattr(source, "read"):
-        raise TypeError(f"An agent is loaded from a path or an open binary file, got {source!r}.")
+    label: Any = "The file"
     try:
-        with zipfile.ZipFile(source) as archive:
+        with files.reading(source, ".zip") as file, zipfile.ZipFile(file) as archive:
+            label = getattr(file, "name", label)
             names = archive.namelist()
             data = json.loads(archive.read("data")) if "data" in names else {}
+            ours = isinstance(data, dict) and data.get("format") == FORMAT
+            if not ours and "_stable_baselines3_version" in names:
+                raise ValueError(
+                    f"{label} was saved by another Stable-Baselines3 algorithm, not by ModelLearningAgent; load it with the "
+                    "class that saved it, for example stable_baselines3.PPO.load(path)."
+                )
             refuse_serialized(data, names)
-            if data.get("format") != FORMAT:
-                raise ValueError("This file was not saved by an mbagent agent; load it with the algorithm that saved it.")
-            arrays = {Path(name).stem: _arrays(archive.read(name)) for name in names if name.endswith(".npz")}
+            if not ours:
+                raise ValueError(f"{label} was not saved by ModelLearningAgent; load it with the program that saved it.")
+            arrays = {Path(name).stem: _arrays(archive, name, label) for name in names if name.endswith(".npz")}
     except (zipfile.BadZipFile, json.JSONDecodeError, UnicodeDecodeError, KeyError, NotImplementedError, zlib.error) as error:
-        raise ValueError(f"This file is no saved agent, or is damaged: {error}.") from error
+        raise ValueError(f"{label} is no saved agent, or is damaged: {error}.") from error
     return data, arrays
 
 
@@ -144,9 +142,8 @@ def refuse_serialized(data: Any, names: list[str]) -> None:
             raise ValueError(f"The file's entry {key!r} is serialized code; mbagent files hold none, so it is refused.")
 
 
-def _arrays(raw: bytes) -> dict[str, NDArray[Any]]:
+def _arrays(archive: zipfile.ZipFile, name: str, label: Any) -> dict[str, NDArray[Any]]:
     try:
-        with np.load(io.BytesIO(raw), allow_pickle=False) as group:
-            return {name: group[name] for name in group.files}
-    except (ValueError, EOFError, TypeError, AttributeError, zipfile.BadZipFile) as error:
-        raise ValueError(f"The file holds an array that needs pickle or is damaged: {error}.") from error
+        return files.arrays(io.BytesIO(archive.read(name)))
+    except ValueError as error:
+        raise ValueError(f"{label} is damaged: its entry {name!r} cannot be read because {error}.") from error

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import os
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Self, cast, get_args
 
@@ -14,6 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 
 from mbagent import persistence
+from mbagent.files import Target
 from mbagent.goals import Source
 from mbagent.rewards import RewardFn
 from mbagent.transitions import TransitionBatch, TransitionDataset
@@ -58,27 +58,29 @@ class SavableAlgorithm(BaseAlgorithm):
 
     def save(  # type: ignore[override]
         self,
-        path: persistence.Target,
+        path: Target,
         exclude: Sequence[str] | None = None,
-        include: Sequence[str] | None = None,
+        include: Sequence[str] | str | None = None,
     ) -> None:
         """Writes settings, weights, start states and the learned reward to a zip that holds no code (see persistence).
 
         Args:
             path: a path (".zip" is added where there is no suffix) or an open binary file.
             exclude: accepted as in SB3; nothing here can be left out.
-            include: ``["transitions"]`` adds what was experienced.
+            include: ``"transitions"``, or a list of it, adds what was experienced.
 
         Raises:
-            ValueError: the model or the exploration is an object that a file cannot rebuild.
+            ValueError: the model or the exploration is an object that a file cannot rebuild, or ``include`` names anything else.
+            TypeError: ``path`` is neither a path nor an open binary file.
+            OSError: the file cannot be written; one that was there before is unchanged.
         """
         del exclude
-        _save(cast("ModelLearningAgent", self), path, include or ())
+        _save(cast("ModelLearningAgent", self), path, [include] if isinstance(include, str) else include or ())
 
     @classmethod
     def load(  # type: ignore[override]
         cls,
-        path: persistence.Target,
+        path: Target,
         env: GymEnv | None = None,
         device: torch.device | str = "auto",
         custom_objects: dict[str, Any] | None = None,
@@ -101,7 +103,7 @@ class SavableAlgorithm(BaseAlgorithm):
             **kwargs: constructor arguments that override the saved ones.
 
         Raises:
-            FileNotFoundError, ValueError: no such file, or no saved agent.
+            FileNotFoundError, TypeError, ValueError: no such file, no path at all, or no saved agent.
         """
         del custom_objects
         if print_system_info:
@@ -119,7 +121,7 @@ class SavableAlgorithm(BaseAlgorithm):
         """Takes weights from a saved agent or from ``get_parameters``; planning caches are dropped, the goal stays."""
         params = load_path_or_dict
         if not isinstance(params, Mapping):
-            params = {"policy": persistence.read(os.fspath(params))[1]["policy"]}
+            params = {"policy": persistence.read(params)[1]["policy"]}
         agent = cast("ModelLearningAgent", self)
         before = agent.policy.parts()
         try:
@@ -134,15 +136,16 @@ class SavableAlgorithm(BaseAlgorithm):
             raise
         agent._refresh()
 
-    def save_transitions(self, path: str) -> None:
-        """Writes what was experienced as an ``.npz`` of plain arrays (see TransitionDataset.save)."""
+    def save_transitions(self, path: Target) -> None:
+        """Writes what was experienced as an ``.npz`` of plain arrays (see TransitionDataset.save, also for what it raises)."""
         cast("ModelLearningAgent", self).experience.dataset.save(path)
 
-    def load_transitions(self, path: str) -> None:
+    def load_transitions(self, path: Target) -> None:
         """Takes transitions from a file into this agent's experience; the next ``learn`` fits to them too.
 
         Raises:
-            ValueError: they come from another kind of environment; nothing is changed then.
+            FileNotFoundError: there is no such file.
+            ValueError: it holds no transitions, or those of another kind of environment; nothing is changed then.
         """
         loaded = TransitionDataset.load(path)
         cast("ModelLearningAgent", self).experience.dataset.take(loaded)
@@ -154,10 +157,10 @@ class SavableAlgorithm(BaseAlgorithm):
         return ["policy"], []
 
 
-def _save(agent: ModelLearningAgent, target: persistence.Target, include: Sequence[str]) -> None:
-    unknown = sorted(set(include) - {"transitions"})
+def _save(agent: ModelLearningAgent, target: Target, include: Sequence[str]) -> None:
+    unknown = [name for name in include if name != "transitions"]
     if unknown:
-        raise ValueError(f"include takes 'transitions' only, got {unknown[0]!r}; everything else is saved anyway.")
+        raise ValueError(f"include takes 'transitions' only, got {unknown[0]!r}; everything else is always saved.")
     if not isinstance(agent.model_name, str):
         raise ValueError(
             f"This agent's model is a {type(agent.model).__name__} object, which a file without code cannot rebuild; "
@@ -206,7 +209,7 @@ def _policy_name(agent: ModelLearningAgent) -> str:
 
 def _load(
     cls: type[ModelLearningAgent],
-    source: persistence.Target,
+    source: Target,
     env: GymEnv | None,
     reward: RewardFn | None,
     force_reset: bool,

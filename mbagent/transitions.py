@@ -6,6 +6,7 @@ import json
 import os
 import tempfile
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -13,8 +14,12 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent import files
+
 _COLUMNS = ("states", "actions", "next_states", "terminated", "rewards", "episodes")
 _KEPT = ("before", "actions", "after", "terminated", "rewards", "episodes")
+
+_ABOUT = "dataset.json"
 
 _MAPPED = 1_000_000
 """Bytes of a selection of mapped rows from which on it is mapped, too."""
@@ -81,7 +86,8 @@ class TransitionDataset:
         cardinalities: number of values of each state factor, length F.
         n_actions: number of enumerated actions A.
         folder: where to keep the rows, in files that grow and are mapped into memory, so that there may be more than fit
-            into it; None to keep them in memory. Rows that are in the folder already are the first.
+            into it; None to keep them in memory. Rows that are in the folder already are the first. Rows count as soon as all
+            columns of a call of ``append`` are on the disk: of one that was interrupted, none do.
 
     Raises:
         ValueError: the folder holds transitions of another environment.
@@ -124,10 +130,11 @@ class TransitionDataset:
             self._chunks.append(narrow)
         elif len(batch):
             folder, n_factors = Path(self.folder), len(self.cardinalities)
-            if len(_mapped(folder, n_factors, self.kind)) != len(self):
-                raise ValueError(f"Another dataset has written to {folder} since this one read it; load it anew.")
-            _write(folder, narrow, len(self))
-            self._chunks = [_mapped(Path(self.folder), len(self.cardinalities), self.kind)]
+            with _locked(folder):
+                if len(_mapped(folder, n_factors, self.kind)) != len(self):
+                    raise ValueError(f"Another dataset has written to {folder} since this one read it; load it anew.")
+                _write(folder, narrow, len(self))
+            self._chunks = [_mapped(folder, n_factors, self.kind)]
 
     def _check(self, batch: TransitionBatch) -> None:
         """Refuses rows that are not of this dataset's kind."""
@@ -212,36 +219,44 @@ class TransitionDataset:
         result: NDArray[np.bool_] = np.isin(groups, order[: max(1, round(fraction * n_groups))])
         return result
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the table as a compressed ``.npz`` (plain arrays: any language reads it, nothing is pickled)."""
-        rows = self.rows()
-        np.savez_compressed(
-            Path(path),
-            cardinalities=np.array(self.cardinalities),
-            n_actions=np.array(self.n_actions),
-            allow_pickle=False,
-            **{name: getattr(rows, kept) for name, kept in zip(_COLUMNS, _KEPT, strict=True)},
-        )
+    def save(self, path: files.Target) -> None:
+        """Writes the table as a compressed ``.npz`` (plain arrays: any language reads it, nothing is pickled).
 
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> TransitionDataset:
-        """Reads what ``save`` wrote; or, mapped into memory, a dataset's folder.
+        Args:
+            path: a path (".npz" is added where it does not end so) or an open binary file.
 
         Raises:
+            TypeError, ValueError: ``path`` is neither.
+            OSError: the file cannot be written; one that was there before is unchanged.
+        """
+        rows = self.rows()
+        with files.writing(path, ".npz", always=True) as file:
+            np.savez_compressed(
+                file,
+                cardinalities=np.array(self.cardinalities),
+                n_actions=np.array(self.n_actions),
+                allow_pickle=False,
+                **{name: getattr(rows, kept) for name, kept in zip(_COLUMNS, _KEPT, strict=True)},
+            )
+
+    @classmethod
+    def load(cls, path: files.Target) -> TransitionDataset:
+        """Reads what ``save`` wrote; or, mapped into memory, a dataset's folder.
+
+        Args:
+            path: a path (".npz" may be left out), an open binary file, or a folder.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            TypeError: ``path`` is none of these.
             ValueError: the file, or what is in the folder, is not such a table.
         """
-        if Path(path).is_dir():
+        if path and isinstance(path, str | os.PathLike) and Path(path).is_dir() and not Path(f"{os.fspath(path)}.npz").is_file():
             about = _about(Path(path))
             return cls(tuple(about["cardinalities"]), about["n_actions"], path)
-        with np.load(Path(path), allow_pickle=False) as archive:
-            missing = [name for name in (*_COLUMNS, "cardinalities", "n_actions") if name not in archive]
-            if missing:
-                raise ValueError(f"{path} is no table of transitions: it lacks {', '.join(missing)}.")
-            data = cls(tuple(int(c) for c in archive["cardinalities"]), int(archive["n_actions"]))
-            columns = {name: archive[name] for name in _COLUMNS}
-        for name in ("actions", "episodes"):
-            columns[name] = columns[name].astype(np.int64)
-        data.append(TransitionBatch(*(columns[name] for name in _COLUMNS)))
+        cardinalities, n_actions, rows = _table(path)
+        data = cls(cardinalities, n_actions)
+        data.append(rows)
         return data
 
 
@@ -261,13 +276,29 @@ def _taken(values: NDArray[Any], rows: NDArray[Any] | slice) -> NDArray[Any]:
     return result
 
 
+def _table(source: files.Target) -> tuple[tuple[int, ...], int, TransitionBatch]:
+    """What a file holds that ``TransitionDataset.save`` wrote: cardinalities, number of actions and rows."""
+    with files.reading(source, ".npz") as file:
+        label = getattr(file, "name", "The file")
+        try:
+            table = files.arrays(file)
+            missing = [name for name in (*_COLUMNS, "cardinalities", "n_actions") if name not in table]
+            if missing:
+                raise ValueError(f"it lacks {', '.join(missing)}")
+            columns: Any = (table[name].astype(np.int64) if name in ("actions", "episodes") else table[name] for name in _COLUMNS)
+            return tuple(int(c) for c in table["cardinalities"]), int(table["n_actions"]), TransitionBatch(*columns)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{label} is no table of transitions that save_transitions wrote: {error}.") from error
+
+
 def _about(folder: Path) -> dict[str, Any]:
-    """What a dataset's folder says of its columns."""
+    """What a dataset's folder says of its columns; ``rows`` is None in folders of before it was written down."""
     try:
-        about = json.loads((folder / "dataset.json").read_text(encoding="utf-8"))
-        return {"cardinalities": [int(c) for c in about["cardinalities"]], "n_actions": int(about["n_actions"])}
+        about = json.loads((folder / _ABOUT).read_text(encoding="utf-8"))
+        kept = {"cardinalities": [int(c) for c in about["cardinalities"]], "n_actions": int(about["n_actions"])}
+        return {**kept, "rows": None if about.get("rows") is None else int(about["rows"])}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{folder} is no folder of transitions: its dataset.json cannot be read ({error}).") from error
+        raise ValueError(f"{folder} is no folder of transitions: its {_ABOUT} cannot be read ({error}).") from error
 
 
 def _begun(folder: Path, cardinalities: tuple[int, ...], n_actions: int, kind: np.dtype[Any]) -> TransitionBatch:
@@ -277,12 +308,14 @@ def _begun(folder: Path, cardinalities: tuple[int, ...], n_actions: int, kind: n
         raise ValueError(
             f"{folder} cannot hold transitions of {len(cardinalities)} factors; give a folder, and a factor at least."
         )
-    if not (folder / "dataset.json").exists():
-        folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / _ABOUT).exists():
+        Path(os.path.realpath(folder)).mkdir(parents=True, exist_ok=True)  # also where a link points to nothing yet
         for name in _COLUMNS:
             (folder / f"{name}.bin").touch()
-        (folder / "dataset.json").write_text(json.dumps(about), encoding="utf-8")
-    if _about(folder) != about:
+        with _locked(folder):
+            if not (folder / _ABOUT).exists():  # another process may have begun it meanwhile, and even written rows
+                files.write(folder / _ABOUT, json.dumps({**about, "rows": _whole_rows(folder, len(cardinalities), kind)}))
+    if {**_about(folder), "rows": None} != {**about, "rows": None}:
         raise ValueError(f"{folder} holds transitions of another environment; choose another folder.")
     return _mapped(folder, len(cardinalities), kind)
 
@@ -293,14 +326,26 @@ def _types(kind: np.dtype[Any]) -> dict[str, np.dtype[Any]]:
     return {name: kinds.get(name, np.dtype(np.int64)).newbyteorder("<") for name in _COLUMNS}
 
 
-def _mapped(folder: Path, n_factors: int, kind: np.dtype[Any]) -> TransitionBatch:
-    """The rows that all files have; one that was cut short counts for nothing."""
-    types, columns = _types(kind), []
+def _whole_rows(folder: Path, n_factors: int, kind: np.dtype[Any]) -> int:
+    """Number of rows that all files have."""
+    types = _types(kind)
     width = {name: n_factors if name in ("states", "next_states") else 1 for name in _COLUMNS}
     missing = [name for name in _COLUMNS if not (folder / f"{name}.bin").exists()]
     if missing:
         raise ValueError(f"{folder} is no folder of transitions: it lacks {missing[0]}.bin.")
-    n = min((folder / f"{name}.bin").stat().st_size // max(1, width[name] * types[name].itemsize) for name in _COLUMNS)
+    return min((folder / f"{name}.bin").stat().st_size // max(1, width[name] * types[name].itemsize) for name in _COLUMNS)
+
+
+def _mapped(folder: Path, n_factors: int, kind: np.dtype[Any]) -> TransitionBatch:
+    """The rows that were written as a whole; what was cut short counts for nothing."""
+    types, columns, written = _types(kind), [], _about(folder)["rows"]
+    n = _whole_rows(folder, n_factors, kind)
+    if written is not None and n < written:
+        raise ValueError(
+            f"{folder} is damaged: a column holds only {n} of the {written} rows written; restore its files from a copy, or set "
+            f"rows to {n} in its {_ABOUT} to go on with those."
+        )
+    n = n if written is None else written
     for name in _COLUMNS:
         shape = (n, n_factors) if name in ("states", "next_states") else (n,)
         wide, path = len(shape) == 2, folder / f"{name}.bin"
@@ -311,10 +356,18 @@ def _mapped(folder: Path, n_factors: int, kind: np.dtype[Any]) -> TransitionBatc
 
 
 def _write(folder: Path, batch: TransitionBatch, n_before: int) -> None:
-    """Adds rows to the files, after the first ``n_before``."""
+    """Adds rows to the files, after the first ``n_before``; they count once ``dataset.json`` says how many there are."""
     for (name, kind), kept in zip(_types(batch.before.dtype).items(), _KEPT, strict=True):
         values = np.ascontiguousarray(getattr(batch, kept), dtype=kind)
         with (folder / f"{name}.bin").open("r+b") as file:
             file.seek(n_before * (values.nbytes // len(batch)))
             file.truncate()
             file.write(values.data)
+            file.flush()
+            os.fsync(file.fileno())
+    files.write(folder / _ABOUT, json.dumps({**_about(folder), "rows": n_before + len(batch)}))
+
+
+def _locked(folder: Path) -> AbstractContextManager[None]:
+    """Lets one process at a time change a folder."""
+    return files.locked(folder / f"{_COLUMNS[0]}.bin")

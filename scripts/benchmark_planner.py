@@ -25,6 +25,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from mbagent import files
 from mbagent.analysis.folders import check_run, open_folder, write_csv
 from mbagent.analysis.planning_benchmark.crowds import WORLDS, compare_values
 from mbagent.analysis.planning_benchmark.latency import SETTINGS, steady
@@ -226,7 +227,7 @@ def main(argv: list[str] | None = None) -> int:
     options = sys.argv[1:] if argv is None else argv
     pictures = write_page(args.output / "report.html", tables, " ".join(["scripts/benchmark_planner.py", *options]))
     for name, png in pictures.items():
-        (args.output / f"{name}.png").write_bytes(png)
+        files.write(args.output / f"{name}.png", png)
     for name, rows in tables.items():
         table = Table(*rows[0], title=TITLES[name])
         for row in rows:

@@ -22,10 +22,11 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from mbagent import files
 from mbagent.analysis.external.besides import BESIDES, BesideWorld
 from mbagent.analysis.external.coverage import Row, Study, draw_coverage, run_study
 from mbagent.analysis.external.worlds import exact_world, find_world
-from mbagent.analysis.folders import check_run, open_folder, replaced, write_csv
+from mbagent.analysis.folders import check_run, open_folder, write_csv
 from mbagent.analysis.parallel import run_all
 from mbagent.exploration import EXPLORATIONS
 
@@ -102,8 +103,7 @@ def main(argv: list[str] | None = None) -> int:
     for result in run_all(run_study, studies, workers=args.workers, console=console, name=line):
         rows += result
         write_csv(args.output / "coverage.csv", rows)
-    with replaced(args.output / "coverage.png") as temporary:
-        temporary.write_bytes(draw_coverage(rows))
+    files.write(args.output / "coverage.png", draw_coverage(rows))
     show(rows, console)
     console.print(f"Wrote coverage.csv and coverage.png to {args.output}.", highlight=False, soft_wrap=True)
     return 0

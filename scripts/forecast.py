@@ -20,6 +20,7 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
+from mbagent import files
 from mbagent.analysis.folders import check_run, open_folder
 from mbagent.analysis.forecasts.experiment import CASES, Outcome, Return, Score, Settings, plan, run_task, save_csv
 from mbagent.analysis.forecasts.page import write_page
@@ -97,7 +98,7 @@ def main(argv: list[str] | None = None) -> int:
         save_csv(args.output / "results.csv", [score for o in outcomes for score in o.scores], Score)
         save_csv(args.output / "returns.csv", [value for o in outcomes for value in o.returns], Return)
     figure = write_page(args.output / "report.html", outcomes, settings, command)
-    (args.output / "forecast.png").write_bytes(figure)
+    files.write(args.output / "forecast.png", figure)
     console.print(f"Wrote report.html, forecast.png and results.csv to {args.output}.")
     return 0
 

@@ -23,9 +23,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from mbagent import files
 from mbagent.analysis.external.curves import PLAYERS, Course, Row, draw_curves, run_course
 from mbagent.analysis.external.worlds import find_world
-from mbagent.analysis.folders import check_run, open_folder, replaced, write_csv
+from mbagent.analysis.folders import check_run, open_folder, write_csv
 from mbagent.analysis.parallel import run_all
 
 QUICK, FULL = (1000, 5000), (10_000, 30_000, 100_000)
@@ -106,8 +107,7 @@ def main(argv: list[str] | None = None) -> int:
     for result in run_all(run_course, courses, workers=args.workers, console=console, name=line):
         rows += result
         write_csv(args.output / "curves.csv", rows)
-    with replaced(args.output / "curves.png") as temporary:
-        temporary.write_bytes(draw_curves(rows))
+    files.write(args.output / "curves.png", draw_curves(rows))
     show(rows, console)
     console.print(f"Wrote curves.csv and curves.png to {args.output}.", highlight=False, soft_wrap=True)
     return 0

@@ -26,6 +26,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from mbagent import files
 from mbagent.analysis.folders import check_run, open_folder, write_csv
 from mbagent.analysis.model_accuracy.experiment import CASES, Outcome, Score, Settings, means, plan, run_task
 from mbagent.analysis.model_accuracy.page import averaged, shown, write_page
@@ -163,7 +164,7 @@ def main(argv: list[str] | None = None) -> int:
     accuracy = [{"world": c, "model": m, "steps": n, **figures} for (c, m, n), figures in sorted(means(scores).items())]
     pictures = write_page(args.output / "report.html", rows, accuracy, "scripts/model_accuracy.py" + " --full" * args.full)
     for name, png in pictures.items():
-        (args.output / f"{name}.png").write_bytes(png)
+        files.write(args.output / f"{name}.png", png)
     for study, found in rows.items():
         show_rows(study, averaged(study, found), console)
     console.print(f"Wrote report.html and the tables to {args.output}.", highlight=False, soft_wrap=True)

@@ -20,6 +20,7 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
+from mbagent import files
 from mbagent.analysis.folders import check_run, open_folder, write_csv
 from mbagent.analysis.parallel import run_all
 from mbagent.analysis.pruning.experiment import FRACTIONS, GAMES, Networks, Outcome, Settings, Way, plan, run_task
@@ -99,7 +100,7 @@ def main(argv: list[str] | None = None) -> int:
         write_csv(args.output / "results.csv", [asdict(row) for o in outcomes for row in o.rows])
         write_csv(args.output / "summary.csv", summary_rows(outcomes))
         for name, png in write_page(args.output / "report.html", outcomes, settings, command, costs).items():
-            (args.output / f"{name}.png").write_bytes(png)
+            files.write(args.output / f"{name}.png", png)
     console.print(f"Wrote report.html, results.csv and the figures to {args.output}.")
     return 0
 

@@ -16,6 +16,7 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
+from mbagent import files
 from mbagent.analysis.accuracy.results import load_scores
 from mbagent.analysis.accuracy.summary import markdown_table
 from mbagent.analysis.cases import CASES
@@ -93,7 +94,7 @@ def _fill(document: Path, tables: Mapping[str, str]) -> None:
     for name, filled in tables.items():
         mark = f"<!-- {name} -->"
         text = re.sub(f"{mark}.*{mark}", f"{mark}\n{filled}\n{mark}", text, flags=re.DOTALL)
-    document.write_text(text, encoding="utf-8")
+    files.write(document, text)
 
 
 def main(args: Args) -> None:

@@ -2,11 +2,14 @@
 
 Numba renews what it keeps when the file of a function changes, but not when a compiled function that it calls from another file
 does. Here everything that was kept is renewed when any file with compiled functions of the same package, or of this one, changes.
+Where nothing can be kept, functions are compiled anew in each process, and one warning says so.
 """
 
 from __future__ import annotations
 
 import hashlib
+import pickle
+import warnings
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -14,6 +17,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import cgutils, types
+from numba.core.caching import FunctionCache
 from numba.extending import intrinsic
 
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -22,7 +26,7 @@ _T = TypeVar("_T")
 
 def compiled(function: _F) -> _F:
     """Compile a function of numbers and arrays; its uncompiled form stays at ``function.py_func``."""
-    return _kept(numba.njit(cache=True, nogil=True)(function), function)
+    return _kept(numba.njit(nogil=True)(function), function)
 
 
 def vectorised(function: _F) -> _F:
@@ -32,19 +36,56 @@ def vectorised(function: _F) -> _F:
     be added without being rounded first; and nothing is raised when something is divided by zero. Arrays must be known to lie
     in one piece: those that ``a, b = np.empty((2, n))`` unpacks are not.
     """
-    return _kept(
-        numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})(function), function
-    )
+    return _kept(numba.njit(nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})(function), function)
 
 
 def _kept(dispatcher: Any, function: _F) -> _F:
-    """The dispatcher, with what it keeps on disk marked by the sources that it was made from."""
-    kept = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-    if kept is not None and hasattr(
-        kept, "_version"
-    ):  # what numba reads first of a file; one with another version counts as empty
-        kept._version = f"{kept._version} {_sources(_top(Path(function.__code__.co_filename)))}"
+    """The dispatcher, with a place on disk for what it compiles, marked by the sources that it is made from."""
+    if hasattr(dispatcher, "enable_caching"):  # a plain function where NUMBA_DISABLE_JIT is set
+        try:
+            dispatcher._cache = _Cache(function)
+        except RuntimeError as error:  # from numba where it finds no folder that can be written to
+            if "no locator available" not in str(error):
+                raise
+            _warn_uncached()
     return cast("_F", dispatcher)
+
+
+class _Cache(FunctionCache):
+    """Numba's, but what cannot be read is compiled, and what cannot be written is not kept: neither stops a program."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        kept: Any = self._cache_file
+        if hasattr(kept, "_version"):  # what numba reads first of a file; one with another version counts as empty
+            kept._version = f"{kept._version} {_sources(_top(Path(function.__code__.co_filename)))}"
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+        except _UNUSABLE:
+            return None  # saving fails for the same reason, and then warns
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+        except _UNUSABLE:
+            _warn_uncached()
+
+
+_UNUSABLE = (OSError, EOFError, pickle.UnpicklingError)
+"""What numba raises where the folder has been removed or write-protected since, the disk is full, or a file is damaged."""
+
+
+@cache
+def _warn_uncached() -> None:
+    """Warns, once in a process, that nothing is kept."""
+    warnings.warn(
+        "No folder to keep compiled functions in is writable, so each process compiles them anew, which takes a minute or two; "
+        "set the environment variable NUMBA_CACHE_DIR to a writable folder.",
+        RuntimeWarning,
+        stacklevel=2,
+    )
 
 
 @cache

@@ -9,6 +9,7 @@ from typing import Any
 
 from rich.console import Console
 
+from mbagent import files
 from mbagent.analysis.cases import CASES, Case, find_case
 from mbagent.analysis.jobs import Job, all_goals
 from mbagent.analysis.records import (
@@ -143,7 +144,7 @@ def run(settings: Settings, folder: Path, *, workers: int, console: Console, res
         for stale in [*kept.glob("*.json"), *kept.glob("*.progress"), *kept.glob("errors.log")]:
             stale.unlink()
     kept.mkdir(parents=True, exist_ok=True)
-    noted.write_text(text, encoding="utf-8")
+    files.write(noted, text)
     return run_jobs(plan_jobs(settings), kept, workers=workers, console=console)
 
 

@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-
-@contextmanager
-def replaced(path: Path) -> Iterator[Path]:
-    """A temporary path beside ``path`` that takes its place when all is written: an interruption loses nothing."""
-    temporary = path.with_name(path.name + ".part")
-    yield temporary
-    temporary.replace(path)
+from mbagent import files
 
 
 def set_aside(folder: Path) -> Path | None:
@@ -53,9 +47,10 @@ def open_folder(folder: Path, console: Console) -> None:
         console.print(f"Moved earlier results to {moved}.", highlight=False, markup=False, soft_wrap=True)
 
 
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Writes a csv with a line for each row; all rows have the keys of the first."""
-    with replaced(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> None:
+    """Writes a csv with a line for each row; all rows have the keys ``columns``, or those of the first."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns or list(rows[0]))
+    writer.writeheader()
+    writer.writerows(rows)
+    files.write(path, text.getvalue())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -12,6 +13,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mbagent import files
 
 AGENT = "Model-learning agent"
 LEARNED_REWARD = "Model-learning agent, reward learned too"
@@ -83,9 +86,7 @@ class Record:
 
 def write_records(path: Path, records: Sequence[Record]) -> None:
     """Writes records as JSON, all or nothing."""
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps([asdict(record) for record in records]), encoding="utf-8")
-    partial.replace(path)
+    files.write(path, json.dumps([asdict(record) for record in records]))
 
 
 def read_records(path: Path) -> list[Record]:
@@ -102,31 +103,32 @@ def write_csv(path: Path, records: Sequence[Record], normalise: Mapping[tuple[st
         records: what to write.
         normalise: (random, reference) mean returns by (case, goal).
     """
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(CSV_COLUMNS)
-        for r in records:
-            random, reference = normalise.get((r.case, r.goal), (float("nan"), float("nan")))
-            score = (r.mean - random) / (reference - random) if reference > random else float("nan")
-            numbers = (
-                r.mean,
-                float(np.std(r.returns)),
-                random,
-                reference,
-                score,
-                r.learn_seconds,
-                r.decision_ms,
-            )
-            names = (r.case, r.agent, r.goal, r.seed, r.steps, len(r.returns))
-            writer.writerow(
-                [
-                    *names,
-                    *(f"{n:.6g}" for n in numbers),
-                    int(r.curve_point),
-                    r.weights_before,
-                    r.weights_after,
-                ]
-            )
+    file = io.StringIO()
+    writer = csv.writer(file)
+    writer.writerow(CSV_COLUMNS)
+    for r in records:
+        random, reference = normalise.get((r.case, r.goal), (float("nan"), float("nan")))
+        score = (r.mean - random) / (reference - random) if reference > random else float("nan")
+        numbers = (
+            r.mean,
+            float(np.std(r.returns)),
+            random,
+            reference,
+            score,
+            r.learn_seconds,
+            r.decision_ms,
+        )
+        names = (r.case, r.agent, r.goal, r.seed, r.steps, len(r.returns))
+        writer.writerow(
+            [
+                *names,
+                *(f"{n:.6g}" for n in numbers),
+                int(r.curve_point),
+                r.weights_before,
+                r.weights_after,
+            ]
+        )
+    files.write(path, file.getvalue())
 
 
 def hash_weights(state: Mapping[str, NDArray[Any]]) -> str:

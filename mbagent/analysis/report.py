@@ -8,6 +8,7 @@ from typing import Any
 
 from gymnasium.error import DependencyNotInstalled
 
+from mbagent import files
 from mbagent.analysis.baselines import SETTINGS
 from mbagent.analysis.cases import Case
 from mbagent.analysis.comparison import Settings
@@ -43,7 +44,7 @@ def write_report(path: Path, results: Sequence[CaseResult], settings: Settings, 
         agents={"agent": AGENT, "learned_reward": LEARNED_REWARD},
         arguments={result.case.key: _words(result.case.kwargs) for result in results},
     )
-    path.write_text(page, encoding="utf-8")
+    files.write(path, page)
 
 
 def _picture(case: Case) -> bytes | None:

@@ -17,6 +17,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from mbagent import files
 from mbagent.analysis.jobs import Job, run_job
 from mbagent.analysis.records import Record, read_records, write_records
 
@@ -68,7 +69,7 @@ def run_jobs(jobs: Sequence[Job], folder: Path, *, workers: int, console: Consol
                 console.print(_line(board, outcome), highlight=False, soft_wrap=True)
     if failures:
         log = folder / "errors.log"
-        log.write_text("\n".join(f"{o.job.name}\n{o.error}" for o in failures), encoding="utf-8")
+        files.write(log, "\n".join(f"{o.job.name}\n{o.error}" for o in failures))
         told = "\n".join(f"  {o.job.name}: {o.error.strip().splitlines()[-1]}" for o in failures)
         raise JobsFailedError(f"{len(failures)} of {len(jobs)} jobs failed; tracebacks are in {log}.\n{told}")
     return records

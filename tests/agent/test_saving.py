@@ -58,6 +58,15 @@ def test_a_loaded_agent_learns_on(agent: ModelLearningAgent, tmp_path: Path) -> 
     assert len(loaded.transitions) == 3200
 
 
+def test_transitions_are_included_by_name_or_in_a_list(agent: ModelLearningAgent, tmp_path: Path) -> None:
+    agent.save(tmp_path / "agent", include="transitions")
+    assert len(ModelLearningAgent.load(tmp_path / "agent", env=gym.make(GEYSER, hit_cost=5.0)).transitions) == 3000
+    for wrong in ("replay", ["transitions", "replay"]):
+        with pytest.raises(ValueError, match="takes 'transitions' only, got 'replay'"):
+            agent.save(tmp_path / "other", include=wrong)
+    assert not (tmp_path / "other.zip").exists()
+
+
 def test_learning_on_without_the_transitions_is_warned_of(agent: ModelLearningAgent, tmp_path: Path) -> None:
     agent.save(tmp_path / "agent")
     loaded = ModelLearningAgent.load(tmp_path / "agent", env=gym.make(GEYSER, hit_cost=5.0))
@@ -119,13 +128,22 @@ def test_the_file_holds_json_and_plain_arrays_only(agent: ModelLearningAgent) ->
 
 
 def test_a_file_with_code_in_it_is_refused_by_the_entrys_name(tmp_path: Path) -> None:
-    PPO("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8).save(tmp_path / "ppo.zip")
+    with zipfile.ZipFile(tmp_path / "pickle.zip", "w") as archive:
+        archive.writestr("data", json.dumps({"format": persistence.FORMAT}))
+        archive.writestr("policy.pth", b"")
     with pytest.raises(ValueError, match=r"\.pth.*pickle"):
-        ModelLearningAgent.load(tmp_path / "ppo.zip")
+        ModelLearningAgent.load(tmp_path / "pickle.zip")
     with zipfile.ZipFile(tmp_path / "evil.zip", "w") as archive:
         archive.writestr("data", json.dumps({"settings": {":type:": "x", ":serialized:": "gASV"}}))
     with pytest.raises(ValueError, match="'settings'"):
         ModelLearningAgent.load(tmp_path / "evil.zip")
+
+
+def test_a_file_of_another_algorithm_is_told_to_be_one(agent: ModelLearningAgent, tmp_path: Path) -> None:
+    PPO("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8).save(tmp_path / "ppo.zip")
+    for load in (ModelLearningAgent.load, agent.set_parameters):
+        with pytest.raises(ValueError, match=r"ppo\.zip was saved by another .* algorithm.*PPO\.load"):
+            load(str(tmp_path / "ppo.zip"))
 
 
 def test_missing_and_damaged_files_are_told_apart(tmp_path: Path) -> None:
@@ -164,9 +182,9 @@ def test_spaces_survive_json(space: spaces.Space[Any]) -> None:
 
 
 def test_transitions_travel_in_plain_files(agent: ModelLearningAgent, tmp_path: Path) -> None:
-    agent.save_transitions(str(tmp_path / "seen.npz"))
+    agent.save_transitions(str(tmp_path / "seen"))
     other = ModelLearningAgent("MctsPolicy", gym.make(GEYSER), seed=3)
-    other.load_transitions(str(tmp_path / "seen.npz"))
+    other.load_transitions(str(tmp_path / "seen"))
     np.testing.assert_array_equal(other.transitions.rows().next_states, agent.transitions.rows().next_states)
     with pytest.raises(ValueError, match="another environment"):
         ModelLearningAgent("MctsPolicy", Corridor()).load_transitions(str(tmp_path / "seen.npz"))

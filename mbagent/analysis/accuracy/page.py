@@ -9,6 +9,7 @@ from pathlib import Path
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
+from mbagent import files
 from mbagent.analysis.accuracy.experiment import Part, Settings
 from mbagent.analysis.accuracy.results import Points
 from mbagent.analysis.accuracy.samplers import CAUSAL, COMBINED, PREDICTOR
@@ -51,7 +52,7 @@ def write_page(path: Path, scores: Mapping[Part, Sequence[Score]], points: Point
         settings=settings,
         command=command,
     )
-    path.write_text(page, encoding="utf-8")
+    files.write(path, page)
 
 
 def _headline(trial: Trial, lines: Sequence[Line]) -> _Headline:

@@ -13,11 +13,12 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent import files
 from mbagent.analysis.accuracy.experiment import Outcome, Settings
 from mbagent.analysis.accuracy.samplers import FitOptions
 from mbagent.analysis.accuracy.scores import Score
 from mbagent.analysis.accuracy.trials import find_trial
-from mbagent.analysis.folders import replaced
+from mbagent.analysis.folders import write_csv
 
 Points: TypeAlias = dict[tuple[str, str], NDArray[np.float64]]
 """(trial, sampler) -> pairs (observed, inferred) [M, 2] of one data set."""
@@ -36,7 +37,7 @@ def first_points(outcomes: Sequence[Outcome]) -> Points:
 
 def save_points(path: Path, points: Points) -> None:
     """Writes points as ``.npz``."""
-    with replaced(path) as temporary, temporary.open("wb") as file:
+    with files.replaced(path) as file:
         np.savez_compressed(file, allow_pickle=False, **{"|".join(key): value for key, value in points.items()})
 
 
@@ -58,10 +59,7 @@ def load_points(path: Path) -> Points:
 
 def save_scores(path: Path, scores: Sequence[Score]) -> None:
     """Writes a csv with a line for each sampler and data set."""
-    with replaced(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(Score)])
-        writer.writeheader()
-        writer.writerows(asdict(score) for score in scores)
+    write_csv(path, [asdict(score) for score in scores], [field.name for field in fields(Score)])
 
 
 def load_scores(path: Path) -> list[Score]:
@@ -90,7 +88,7 @@ def load_scores(path: Path) -> list[Score]:
 
 def save_settings(path: Path, settings: Settings) -> None:
     """Writes the settings as JSON."""
-    path.write_text(json.dumps(asdict(settings), indent=1), encoding="utf-8")
+    files.write(path, json.dumps(asdict(settings), indent=1))
 
 
 def load_settings(path: Path) -> Settings:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -15,6 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import mbagent
+from mbagent.analysis.folders import write_csv
 from mbagent.analysis.forecasts import measures as m
 from mbagent.models.base import Actions, Keys, States
 from mbagent.models.factory import build_direct
@@ -263,7 +263,4 @@ def _play(task: Task, model: DirectForecastModel) -> list[Return]:
 
 def save_csv(path: Path, rows: Sequence[Score] | Sequence[Return], kind: type[Score] | type[Return]) -> None:
     """Writes a csv with a line for each."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(kind)])
-        writer.writeheader()
-        writer.writerows(asdict(row) for row in rows)
+    write_csv(path, [asdict(row) for row in rows], [field.name for field in fields(kind)])

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from mbagent import files
 from mbagent.analysis.forecasts.experiment import CASES, Method, Outcome, Return, Score, Settings
 from mbagent.analysis.pages import FIGURE_STYLE, render, to_png
 from mbagent.analysis.statistics import Interval, mean_interval
@@ -79,7 +80,7 @@ def write_page(path: Path, outcomes: Sequence[Outcome], settings: Settings, comm
     found = tables([s for o in outcomes for s in o.scores], [r for o in outcomes for r in o.returns])
     figure = draw_errors(found)
     page = render("forecasts.html.jinja", tables=found, measures=MEASURES, figure=figure, settings=settings, command=command)
-    path.write_text(page, encoding="utf-8")
+    files.write(path, page)
     return figure
 
 

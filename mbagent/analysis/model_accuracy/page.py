@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
 
+from mbagent import files
 from mbagent.analysis.model_accuracy.studies import STUDIES
 from mbagent.analysis.pages import FIGURE_STYLE, format_number, render, to_png
 
@@ -73,7 +74,7 @@ def write_page(path: Path, results: Mapping[str, Sequence[Row]], accuracy: Seque
         docs=docs,
         command=command,
     )
-    path.write_text(page, encoding="utf-8")
+    files.write(path, page)
     return pictures
 
 

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
+from mbagent import files
 from mbagent.analysis.pages import FIGURE_STYLE, format_number, render, to_png
 
 Row: TypeAlias = Mapping[str, Any]
@@ -113,5 +114,5 @@ def write_page(path: Path, tables: Mapping[str, Sequence[Row]], command: str) ->
     full = {name: list(tables[name]) for name in TITLES if tables.get(name)}
     pictures = {"regret": draw_regret(full["regret"])} if "regret" in full else {}
     given = {"tables": full, "pictures": pictures, "titles": TITLES, "notes": NOTES, "command": command}
-    path.write_text(render("planning.html.jinja", filters={"shown": shown}, **given), encoding="utf-8")
+    files.write(path, render("planning.html.jinja", filters={"shown": shown}, **given))
     return pictures

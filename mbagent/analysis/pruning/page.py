@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from mbagent import files
 from mbagent.analysis.cases import find_case, game_of
 from mbagent.analysis.pages import FIGURE_STYLE, format_number, render, to_png
 from mbagent.analysis.pruning.experiment import Key, Outcome, Settings, Way
@@ -144,7 +145,7 @@ def write_page(
         sizes=sizes,
         exponents={name: exponent(sizes, name) for name in ("whole", "pruned")} if len({row.d for row in sizes}) > 1 else {},
     )
-    path.write_text(page, encoding="utf-8")
+    files.write(path, page)
     return pictures
 
 

@@ -1,0 +1,241 @@
+"""Files that are whole or not there: written under another name in the same folder, flushed to the disk, then renamed.
+
+A file that is being written is locked (``flock``), and whoever saves at the same path later removes those that nobody has locked:
+they are of writers that were killed. The operating system frees a lock when its process ends, however it ends. So locks tell live
+from dead in other containers, too, where process numbers mean nothing, and on other machines if the file system carries locks;
+and no slow writer is taken for a dead one, as by an age. Where there are no such locks (Windows, some network file systems) files
+are as safe, but what killed writers leave is not removed.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import re
+import stat
+import sys
+import uuid
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from pathlib import Path
+from typing import Any, BinaryIO, TypeGuard
+
+import numpy as np
+from numpy.typing import NDArray
+
+if sys.platform != "win32":
+    import fcntl
+
+Target = str | os.PathLike[str] | BinaryIO
+"""Where to save to or load from: a path or an open binary file."""
+
+
+def write(path: Path, content: str | bytes) -> None:
+    """Writes a whole file; text as UTF-8, its line ends as they are.
+
+    Raises:
+        OSError: see ``replaced``.
+    """
+    with replaced(path) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
+def writing(target: Target, suffix: str, *, always: bool) -> AbstractContextManager[BinaryIO]:
+    """A file to write to: an open one as it is, or the whole of the one at a path.
+
+    Args:
+        target: the path or the open file.
+        suffix: what is appended to the path.
+        always: append it unless the path ends with it, as NumPy does; else only to a path without any suffix, as SB3 does.
+
+    Raises:
+        TypeError, ValueError: ``target`` is neither.
+        OSError: see ``replaced``.
+    """
+    if _is_open(target, "write"):
+        return nullcontext(target)
+    path = _checked(target)
+    bare = path.suffix != suffix if always else not path.suffix
+    return replaced(Path(f"{path}{suffix}") if bare else path)
+
+
+def reading(source: Target, suffix: str) -> AbstractContextManager[BinaryIO]:
+    """A file to read: an open one as it is, or that at a path, with ``suffix`` appended where there is none without.
+
+    Raises:
+        TypeError, ValueError: ``source`` is neither.
+        FileNotFoundError: there is none; the message names the paths tried.
+    """
+    if _is_open(source, "read"):
+        return nullcontext(source)
+    path = _checked(source)
+    tried = [path] if path.suffix == suffix else [path, Path(f"{path}{suffix}")]
+    for candidate in tried:
+        if candidate.is_file():
+            return candidate.open("rb")
+    raise FileNotFoundError(f"There is no file {' or '.join(map(str, tried))}; check the path, or save there first.")
+
+
+def arrays(file: BinaryIO) -> dict[str, NDArray[Any]]:
+    """The arrays of an ``.npz``.
+
+    Raises:
+        ValueError: it is none, is damaged, or holds pickles. NumPy's own message is left out: it may advise to allow pickles,
+            which run code when read.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            return {name: np.asarray(archive[name]) for name in archive.files}
+    except (ValueError, EOFError, TypeError, AttributeError, KeyError, zipfile.BadZipFile, zlib.error):
+        raise ValueError("it is no .npz of plain arrays or is damaged") from None
+
+
+def _is_open(target: Any, method: str) -> TypeGuard[BinaryIO]:
+    """Whether it is an open binary file."""
+    if isinstance(target, io.TextIOBase):
+        raise TypeError("The file is open in text mode; open it in binary mode ('wb' to save, 'rb' to load), or pass its path.")
+    return hasattr(target, method) and not isinstance(target, str | os.PathLike)
+
+
+def _checked(target: Any) -> Path:
+    """The path of a file."""
+    if not isinstance(target, str | os.PathLike):
+        raise TypeError(f"Files are saved to and loaded from a path or an open binary file, got {target!r}.")
+    path = Path(target)
+    if not path.name:
+        raise ValueError(f"The path must name a file, got {os.fspath(target)!r}.")
+    return path
+
+
+@contextmanager
+def replaced(path: Path) -> Iterator[BinaryIO]:
+    """A new binary file that takes the place of ``path`` when the block ends: whatever interrupts it, the old one is still there.
+
+    Missing folders are made, symbolic links followed, and the permissions of a file that was there before are kept.
+
+    Raises:
+        IsADirectoryError, NotADirectoryError: there is a folder at the path, or a file where its folder should be.
+        PermissionError: the folder or the file must not be written to.
+        OSError: another reason, such as a full disk.
+    """
+    path = Path(os.path.realpath(path))
+    before = _before(path)
+    _remove_abandoned(path)
+    with _explained(path):
+        temporary, file = _begun(path)
+    try:
+        with file:
+            yield file
+            if before is not None:
+                _like(temporary, before)
+            file.flush()
+            os.fsync(file.fileno())
+            if sys.platform == "win32":  # which renames no open file; elsewhere it stays open, and so locked, until it is renamed
+                file.close()
+            with _explained(path):
+                temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    _sync(path.parent)
+
+
+def _before(path: Path) -> os.stat_result | None:
+    """What is known of the file that will be replaced; None where there is none. Makes its folder."""
+    try:
+        with _explained(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            before = path.stat()
+    except FileNotFoundError:
+        return None
+    except (FileExistsError, NotADirectoryError) as error:
+        raise NotADirectoryError(f"{path} cannot be written: a part of this path is a file, not a folder.") from error
+    if stat.S_ISDIR(before.st_mode):
+        raise IsADirectoryError(f"{path} is a folder; give the path of a file.")
+    if not stat.S_ISREG(before.st_mode):
+        raise ValueError(f"{path} is a device or a pipe, which cannot be replaced; give the path of a file, or an open file.")
+    if not os.access(path, os.W_OK):
+        raise PermissionError(f"{path} is write-protected; make it writable or choose another path.")
+    return before
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Says why a file that may itself be writable cannot be replaced."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
+            raise
+        raise PermissionError(
+            f"{path} cannot be written because no file can be created and renamed in {path.parent}, which is needed so that "
+            "an interruption never destroys the previous file; make the folder writable or choose another path."
+        ) from error
+
+
+def _begun(path: Path) -> tuple[Path, BinaryIO]:
+    """A new, locked file of a unique name beside ``path``, with the permissions that any new file gets there."""
+    while True:
+        temporary = path.with_name(f"{_prefix(path)}{uuid.uuid4().hex}.part")
+        file = temporary.open("xb")
+        with suppress(OSError):
+            _lock(file, wait=True)
+        if temporary.exists():
+            return temporary, file
+        file.close()  # taken for abandoned between being created and being locked
+
+
+def _prefix(path: Path) -> str:
+    """How the names of temporary files begin; file systems allow names 255 bytes."""
+    return f".{os.fsencode(path.name)[:200].decode(errors='ignore')}."
+
+
+def _remove_abandoned(path: Path) -> None:
+    """Removes what killed writers to ``path`` have left."""
+    pattern = re.compile(rf"{re.escape(_prefix(path))}[0-9a-f]{{32}}\.part")
+    with suppress(OSError):
+        for other in [other for other in path.parent.iterdir() if pattern.fullmatch(other.name)]:
+            with suppress(OSError), other.open("r+b") as file:
+                _lock(file, wait=False)  # fails while its writer is alive
+                other.unlink()
+
+
+def _lock(file: BinaryIO, *, wait: bool) -> None:
+    """Locks a file until it is closed.
+
+    Raises:
+        OSError: another has locked it, or there are no locks.
+    """
+    if sys.platform == "win32":
+        raise OSError(errno.ENOTSUP, "no locks")
+    fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Lets one process at a time in: those that lock the same file wait; nobody waits where there are no locks."""
+    with path.open("r+b") as file:
+        with suppress(OSError):
+            _lock(file, wait=True)
+        yield
+
+
+def _like(path: Path, before: os.stat_result) -> None:
+    """Gives a file the permissions of another, and where this is allowed its owner."""
+    if sys.platform != "win32":
+        with suppress(OSError):
+            os.chown(path, before.st_uid, before.st_gid)
+    path.chmod(stat.S_IMODE(before.st_mode))
+
+
+def _sync(folder: Path) -> None:
+    """Flushes a folder's names to the disk; some systems cannot, and the file is whole under either name."""
+    with suppress(OSError):
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
