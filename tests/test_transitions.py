@@ -1,5 +1,7 @@
 """Rows in memory and in files: narrow, whole, and refused where they are of another world."""
 
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -132,3 +134,17 @@ def test_a_file_or_half_a_folder_is_no_folder_of_transitions(tmp_path: Path) -> 
     (tmp_path / "rows" / "rewards.bin").unlink()
     with pytest.raises(ValueError, match=r"lacks rewards\.bin"):
         TransitionDataset.load(tmp_path / "rows")
+
+
+def test_rows_that_are_added_while_another_thread_reads_are_not_lost() -> None:
+    data, one, before = TransitionDataset(CARDINALITIES, 4), batch(1), sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(1) as pool:
+            reading = pool.submit(lambda: [len(data.rows()) for _ in range(1500)])
+            for _ in range(1500):
+                data.append(one)
+            assert max(reading.result(60)) <= 1500
+    finally:
+        sys.setswitchinterval(before)
+    assert len(data.rows()) == 1500
