@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar, Self, cast
 
 import numpy as np
@@ -301,7 +303,7 @@ class ModelLearningAgent(PrunableAlgorithm):
         finally:  # an interrupted run keeps what it met: learn(0) fits to it
             self._recorder.flush()
         if len(self.experience.dataset):
-            with self.policy.lock:
+            with self.policy.lock, self._undone_on_error():
                 self._fit(self._recorder, progress_bar)
             if log_interval is not None:
                 log_rollout(self, self.start_time, self._num_timesteps_at_start)
@@ -333,6 +335,21 @@ class ModelLearningAgent(PrunableAlgorithm):
                 return False
         callback.on_rollout_end()
         return True
+
+    @contextmanager
+    def _undone_on_error(self) -> Iterator[None]:
+        """Puts back what the agent has learned if a fit does not come to its end: half of it must not be planned with."""
+        policy, before, goal = self.policy, self.policy.parts(), self.policy.goal
+        weights = policy.state_dict() if policy.fitted else {}
+        try:
+            yield
+        except BaseException:
+            if weights:
+                policy.recode(*before)
+                self.goals.recode()
+                policy.load_state_dict(weights)
+                policy.set_goal(goal)
+            raise
 
     def _fit(self, recorder: ExperienceRecorder, progress_bar: bool) -> None:
         """Fits the model, then works out goal and machine."""

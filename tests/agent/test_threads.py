@@ -171,6 +171,31 @@ def test_learning_values_that_was_broken_off_is_begun_anew(call: int) -> None:
     assert decided(agent, obs) == alone
 
 
+def test_a_fit_that_was_broken_off_is_undone(monkeypatch: pytest.MonkeyPatch) -> None:
+    agent = ModelLearningAgent("MctsPolicy", Corridor(limit=30), seed=0, reward=arriving(3), model="tabular")
+    agent.learn(30, log_interval=None)
+    before, alone = agent.get_parameters()["policy"], agent.explain(2).values
+    fit = agent.model.fit
+
+    def stopped(*args: Any, **kwargs: Any) -> None:
+        fit(*args, **kwargs)
+        raise KeyboardInterrupt
+
+    def unchanged() -> bool:
+        now = agent.get_parameters()["policy"]
+        return all(before[name].equal(now[name]) for name in {**before, **now})
+
+    monkeypatch.setattr(agent.model, "fit", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        agent.learn(400, log_interval=None)
+    assert unchanged()
+    np.testing.assert_array_equal(agent.explain(2).values, alone)
+    monkeypatch.undo()
+    agent.learn(0)
+    assert len(agent.transitions) == 430
+    assert not unchanged()
+
+
 @pytest.mark.parametrize("use", ["predict", "explain", "set_reward"])
 def test_a_reward_function_that_uses_the_agent_that_plans_with_it_is_told_so(use: str, catcher: ModelLearningAgent) -> None:
     agent, obs, calls = copy.deepcopy(catcher), observations(1)[0], 0
