@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar, Self, cast
 
 import numpy as np
@@ -35,6 +37,7 @@ from mbagent.pruned import PrunableAlgorithm
 from mbagent.reporting import fit_progress, log_fit, log_rollout
 from mbagent.rewards import RewardFn
 from mbagent.spaces import ActionEnumeration, FactoredSpace
+from mbagent.subprocesses import ENDED, has_ended, naming_ended_processes, step
 from mbagent.transitions import TransitionDataset
 from mbagent.wrapping import wrap_env
 
@@ -53,6 +56,10 @@ class ModelLearningAgent(PrunableAlgorithm):
 
     ``learn`` explores, records transitions and fits a transition model (paper section 3). ``predict`` plans
     on the model (section 4) towards the current goal: the environment's own reward, or whatever ``set_reward`` names.
+
+    Any number of threads may call ``predict``, ``explain``, ``set_reward``, ``save`` and ``get_parameters`` of one agent while
+    another one is in ``learn``, ``prune`` or ``set_parameters``: calls wait for each other, and their results are those of one
+    thread. To plan in parallel, give each thread or process an agent of its own (``copy.deepcopy(agent)``).
 
     Args:
         policy: the planner: "MctsPolicy" (also "MlpPolicy", "CnnPolicy", "MultiInputPolicy"), "FlatMonteCarloPolicy",
@@ -207,6 +214,8 @@ class ModelLearningAgent(PrunableAlgorithm):
     def set_reward(self, reward: RewardFn | None) -> None:
         """Changes the goal; nothing is learned anew and no weight of the transition model changes.
 
+        A ``predict`` in another thread plans for the old goal or for the new one, never for a mixture.
+
         Args:
             reward: see RewardFn; None for the environment's own reward (or the learned one, see ``goals``).
 
@@ -215,7 +224,8 @@ class ModelLearningAgent(PrunableAlgorithm):
             RuntimeError: it raised an error, the cause of this one; the old goal stays. (``predict`` raises this, too, where it
                 fails for transitions that are only imagined; the next goal is planned for as if nothing had been.)
         """
-        self.policy.set_goal(self.goals.choose(reward))
+        with self.policy.lock:
+            self.policy.set_goal(self.goals.choose(reward))
 
     def explain(self, obs: Any, *, n_futures: int = 3, n_steps: int = 10) -> Explanation:
         """Why ``predict`` takes the action it takes: every action's value, standard error, visits and likeliest futures.
@@ -264,15 +274,20 @@ class ModelLearningAgent(PrunableAlgorithm):
             tb_log_name: name of the run in TensorBoard.
             reset_num_timesteps: False counts on from the last call.
             progress_bar: shows one (needs ``pip install "mbagent[progress]"``).
+
+        Raises:
+            RuntimeError: a process of a SubprocVecEnv has ended. After this or any other error the steps recorded so far are
+                kept: ``learn(0)`` fits to them without using the environment; ``learn`` with more steps begins with a reset.
         """
         if self.env is None:
             raise ValueError("learn() needs an environment; give one with set_env(env) or load(path, env=env).")
         fresh_start = reset_num_timesteps or self._last_obs is None or self._recorder is None
         steps, log_interval = check_timesteps(total_timesteps), check_log_interval(log_interval)
         total, callbacks = self._setup_learn(steps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        if fresh_start or self._recorder is None:
+        if self._recorder is None or (fresh_start and self._last_obs is not None):
             self._recorder = ExperienceRecorder(self.experience.space, self.experience.dataset, self.n_envs)
-            self._recorder.reset(self._last_obs)
+            if self._last_obs is not None:
+                self._recorder.reset(self._last_obs)
             catch_up(self._explorer, self.experience.dataset)
         warn_of_forgetting(self.policy.fitted and isinstance(self.model_name, str), self.experience.dataset)
         callbacks.on_training_start(locals(), globals())
@@ -288,7 +303,8 @@ class ModelLearningAgent(PrunableAlgorithm):
         finally:  # an interrupted run keeps what it met: learn(0) fits to it
             self._recorder.flush()
         if len(self.experience.dataset):
-            self._fit(self._recorder, progress_bar)
+            with self.policy.lock, self._undone_on_error():
+                self._fit(self._recorder, progress_bar)
             if log_interval is not None:
                 log_rollout(self, self.start_time, self._num_timesteps_at_start)
                 self.logger.dump(self.num_timesteps)
@@ -303,14 +319,15 @@ class ModelLearningAgent(PrunableAlgorithm):
             assert recorder.states is not None
             indices = self._explorer.act(recorder.states, self._rng)
             actions = self.policy.actions.decode(indices)
-            new_obs, rewards, dones, infos = env.step(actions)
+            self._last_obs = None  # should the step fail, it is not known where the environment stands
+            new_obs, rewards, dones, infos = step(env, actions)
             self.num_timesteps += env.num_envs
             if (original := self._vec_normalize_env) is not None:
                 new_obs, rewards = original.get_original_obs(), original.get_original_reward()
-            step = recorder.record(indices, new_obs, rewards, dones, infos)
+            recorded = recorder.record(indices, new_obs, rewards, dones, infos)
+            self._last_obs, self._last_episode_starts = new_obs, dones
             if watcher is not None:
-                watcher.observe(step.states, step.actions, step.next_states, dones)
-            self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]  # Tuple spaces too
+                watcher.observe(recorded.states, recorded.actions, recorded.next_states, dones)
             self._update_info_buffer(infos, dones)
             self._episode_num += int(dones.sum())
             callback.update_locals(locals())
@@ -318,6 +335,21 @@ class ModelLearningAgent(PrunableAlgorithm):
                 return False
         callback.on_rollout_end()
         return True
+
+    @contextmanager
+    def _undone_on_error(self) -> Iterator[None]:
+        """Puts back what the agent has learned if a fit does not come to its end: half of it must not be planned with."""
+        policy, before, goal = self.policy, self.policy.parts(), self.policy.goal
+        weights = policy.state_dict() if policy.fitted else {}
+        try:
+            yield
+        except BaseException:
+            if weights:
+                policy.recode(*before)
+                self.goals.recode()
+                policy.load_state_dict(weights)
+                policy.set_goal(goal)
+            raise
 
     def _fit(self, recorder: ExperienceRecorder, progress_bar: bool) -> None:
         """Fits the model, then works out goal and machine."""
@@ -346,5 +378,31 @@ class ModelLearningAgent(PrunableAlgorithm):
         super().set_env(env, force_reset)
         assert self.env is not None
         self._recorder = None
-        self.goals.take_environment(self.env)
-        self._refresh()
+        with self.policy.lock:
+            self.goals.take_environment(self.env)
+            self._refresh()
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        """As SB3's; but for no steps at all an environment that has failed is left alone."""
+        assert self.env is not None
+        rest = tb_log_name, progress_bar
+        ended = has_ended(self.env)
+        if total_timesteps > 0 and ended:
+            raise RuntimeError(ENDED)
+        if total_timesteps > 0 or not (ended or (self._recorder is not None and self._last_obs is None)):
+            with naming_ended_processes(self.env):
+                return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *rest)
+        if reset_num_timesteps:
+            self.num_timesteps = self._episode_num = 0
+        self._last_obs = np.zeros(0)  # one must be there for SB3 not to reset the environment
+        try:
+            return super()._setup_learn(0, callback, False, *rest)
+        finally:
+            self._last_obs = None

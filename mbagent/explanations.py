@@ -141,6 +141,11 @@ def explain(policy: PlannerPolicy, observation: Any, n_futures: int = 3, n_steps
     for name, value in (("n_futures", n_futures), ("n_steps", n_steps)):
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
             raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")
+    with policy.lock.planning():
+        return _explained(policy, observation, n_futures, n_steps)
+
+
+def _explained(policy: PlannerPolicy, observation: Any, n_futures: int, n_steps: int) -> Explanation:
     state = _single_state(policy, observation)
     # A deadline, or the last decision's tree, would make two explanations of one observation differ.
     settings = replace(policy.settings, time_budget=None, reuse_tree=False)

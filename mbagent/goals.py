@@ -14,6 +14,7 @@ from mbagent.learned_reward import RewardReport
 from mbagent.planning.goal import Goal
 from mbagent.policies import PlannerPolicy
 from mbagent.rewards import GivenReward, RewardFn
+from mbagent.subprocesses import own_reward
 from mbagent.transitions import TransitionDataset
 
 Source = Literal["custom", "environment", "learned", "missing"]
@@ -55,6 +56,7 @@ class GoalBook:
         self._environment: GivenReward | None = None
         self._since = 0
         self._has_environment = False
+        self._no_function = ""
         self._changes_rewards: str | None = None
         self._told: str | None = None
         self.source: Source = "environment"
@@ -64,10 +66,7 @@ class GoalBook:
     def take_environment(self, env: VecEnv) -> None:
         """Takes the ``reward_fn`` of a new environment, if it has one."""
         self._since, self._has_environment = len(self._experience.dataset), True
-        try:
-            fn = env.get_attr("reward_fn", indices=0)[0]
-        except Exception:  # a VecEnv in another process answers with whatever error pickling gives
-            fn = None
+        fn, self._no_function = own_reward(env)
         self._environment = self._given(fn) if callable(fn) else None
         self._changes_rewards, self._told = reward_wrapper(env), None
 
@@ -153,7 +152,7 @@ class GoalBook:
     def _environment_problem(self) -> str | None:
         """Why the environment's own reward function cannot be used, or None."""
         if self._environment is None:
-            return "The environment has no reward_fn" if self._has_environment else "There is no environment"
+            return self._no_function if self._has_environment else "There is no environment"
         rows = self._transitions.rows()
         rows = rows.select(np.arange(self._since, len(rows)))
         try:

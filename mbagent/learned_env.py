@@ -50,6 +50,10 @@ class LearnedEnv(gym.Env[Any, Any]):
         self, agent: ModelLearningAgent, reward_fn: RewardFn | None = None, *, max_episode_steps: int | None = None
     ) -> None:
         """See the class."""
+        with agent.policy.lock:
+            self._take(agent, reward_fn, max_episode_steps)
+
+    def _take(self, agent: ModelLearningAgent, reward_fn: RewardFn | None, max_episode_steps: int | None) -> None:
         policy = agent.policy
         if not policy.fitted:
             raise ValueError("This agent has learned nothing yet, so there is no world to have back; call learn() first.")
@@ -94,12 +98,13 @@ class LearnedEnv(gym.Env[Any, Any]):
     def _earned(self, states: States, actions: Actions, following: States) -> float:
         """The reward of a transition; it is asked for once, as learned rewards and users' functions are quick in batches only."""
         key = states.tobytes() + actions.tobytes() + following.tobytes()
-        if key not in self._rewards:
-            if len(self._rewards) >= MOST_REWARDS:
-                self._rewards.clear()
-            assert self._reward is not None
-            self._rewards[key] = float(self._reward(states, actions, following)[0])
-        return self._rewards[key]
+        if (known := self._rewards.get(key)) is not None:
+            return known
+        if len(self._rewards) >= MOST_REWARDS:
+            self._rewards.clear()
+        assert self._reward is not None
+        reward = self._rewards[key] = float(self._reward(states, actions, following)[0])
+        return reward
 
     def _shown(self, state: States) -> Any:
         return _first(self._space.decode(state))

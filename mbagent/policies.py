@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
 from mbagent.learned_reward import LearnedReward
+from mbagent.locks import PlanningLock
 from mbagent.models.base import States, TransitionModel
 from mbagent.planning.flat_monte_carlo import FlatMonteCarlo, direct_model
 from mbagent.planning.goal import Goal
@@ -34,6 +35,9 @@ class PlannerPolicy(BasePolicy):
     Its parameters are those of the transition model and of the learned reward; ``state_dict`` and ``load_state_dict``
     reach both, and loading drops every planning cache.
 
+    Any number of threads may call its methods: each call waits for the one before it (see PlanningLock), so that the outcomes are
+    those of a single thread. Hold ``lock`` where several calls must not be parted.
+
     Args:
         observation_space: a discrete space (see FactoredSpace).
         action_space: a discrete space (see ActionEnumeration).
@@ -42,6 +46,9 @@ class PlannerPolicy(BasePolicy):
         reward_model: the learned reward.
         settings: see PlannerSettings.
         factored: the observation space as factors, which the models are of; None for it as declared.
+
+    Attributes:
+        lock: held by whatever plans, or reads or changes what plans depend on.
 
     Raises:
         ValueError: forecasts="direct" with another planner, or with a model that has none; a time budget or the reuse of trees
@@ -64,6 +71,7 @@ class PlannerPolicy(BasePolicy):
         """See the class."""
         super().__init__(observation_space, action_space)
         del lr_schedule
+        self.lock = PlanningLock()
         self.factored = factored if factored is not None else FactoredSpace(observation_space)
         self.actions = ActionEnumeration(action_space)
         self.transition_model, self.reward_model, self.settings = model, reward_model, settings
@@ -84,8 +92,9 @@ class PlannerPolicy(BasePolicy):
 
     def refresh(self, goal: Goal | None = None) -> None:
         """Drops every cache after new weights or start states; takes a new goal if one is given."""
-        self.planner.set_model(self.transition_model, self.start_states)
-        self.set_goal(goal if goal is not None else self.goal)
+        with self.lock:
+            self.planner.set_model(self.transition_model, self.start_states)
+            self.set_goal(goal if goal is not None else self.goal)
 
     def parts(self) -> tuple[FactoredSpace, TransitionModel, LearnedReward, States, bool]:
         """What is known, and in which factors; see ``recode``."""
@@ -95,25 +104,29 @@ class PlannerPolicy(BasePolicy):
         self, factored: FactoredSpace, model: TransitionModel, reward_model: LearnedReward, start_states: States, fitted: bool
     ) -> None:
         """Takes over what is known in other factors; no goal is left."""
-        self.factored, self.transition_model, self.reward_model = factored, model, reward_model
-        self.start_states, self.fitted, self.goal = start_states, fitted, None
-        self.refresh()
+        with self.lock:
+            self.factored, self.transition_model, self.reward_model = factored, model, reward_model
+            self.start_states, self.fitted, self.goal = start_states, fitted, None
+            self.refresh()
 
     def set_goal(self, goal: Goal | None) -> None:
         """Takes a goal (None: none is known, so ``predict`` refuses)."""
-        self.goal = goal
-        if goal is not None:
-            self.planner.set_goal(goal)
+        with self.lock:
+            self.goal = goal
+            if goal is not None:
+                self.planner.set_goal(goal)
 
     def plan(self, states: States) -> Plan:
         """Plans from factored states int64 [B, F].
 
         Raises:
             ValueError: no goal is known.
+            RuntimeError: called by the reward function, in the middle of a plan.
         """
-        if self.goal is None:
-            raise ValueError(NO_GOAL)
-        return self.planner.plan(states)
+        with self.lock.planning():
+            if self.goal is None:
+                raise ValueError(NO_GOAL)
+            return self.planner.plan(states)
 
     def predict(
         self,
@@ -122,7 +135,7 @@ class PlannerPolicy(BasePolicy):
         episode_start: NDArray[Any] | None = None,
         deterministic: bool = False,
     ) -> tuple[Any, tuple[NDArray[Any], ...] | None]:
-        """The planner's best action for one observation or a batch.
+        """The planner's best action for one observation or a batch; any number of threads may ask at once.
 
         Args:
             observation: one observation of the space, or a batch of them.
@@ -135,16 +148,18 @@ class PlannerPolicy(BasePolicy):
 
         Raises:
             ValueError: an observation outside the space, or no goal known (see ``NO_GOAL``).
+            RuntimeError: the reward function raised an error, the cause of this one.
         """
         batch, single = as_batch(self.observation_space, observation)
-        states = self.factored.encode(batch)
-        if self.settings.reuse_tree and isinstance(self.planner, MctsPlanner) and np.any(episode_start):
-            self.planner.forget()
-        if self.fitted:
-            indices = self.plan(states).actions
-        else:
-            self._warn_unfitted()
-            indices = self._random.integers(self.actions.n, size=len(states))
+        with self.lock:
+            states = self.factored.encode(batch)
+            if self.settings.reuse_tree and isinstance(self.planner, MctsPlanner) and np.any(episode_start):
+                self.planner.forget()
+            if self.fitted:
+                indices = self.plan(states).actions
+            else:
+                self._warn_unfitted()
+                indices = self._random.integers(self.actions.n, size=len(states))
         actions = self.actions.decode(indices)
         return (actions[0] if single else actions), state
 
@@ -167,9 +182,10 @@ class PlannerPolicy(BasePolicy):
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """As ``state_dict``, as numpy arrays."""
-        parts = {"model": self.transition_model.state_dict(), "reward": self.reward_model.state_dict()}
-        arrays = {f"{part}.{name}": value for part, state in parts.items() for name, value in state.items()}
-        return arrays | self.factored.value_arrays()
+        with self.lock:
+            parts = {"model": self.transition_model.state_dict(), "reward": self.reward_model.state_dict()}
+            arrays = {f"{part}.{name}": value for part, state in parts.items() for name, value in state.items()}
+            return arrays | self.factored.value_arrays()
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> None:
         """Takes weights over and drops every cache.
@@ -178,7 +194,10 @@ class PlannerPolicy(BasePolicy):
             ValueError: the weights do not fit; nothing is changed then.
         """
         del assign
-        arrays = {name: np.asarray(value) for name, value in state_dict.items()}
+        with self.lock:
+            self._load({name: np.asarray(value) for name, value in state_dict.items()}, strict)
+
+    def _load(self, arrays: dict[str, NDArray[Any]], strict: bool) -> None:
         if not strict:
             arrays = {**self.arrays(), **arrays}
         own = self.factored.value_arrays()

@@ -59,11 +59,11 @@ class PrunableAlgorithm(SavableAlgorithm):
                 "prune() trains what is left on the transitions met, and this agent has none: give it some with "
                 "load_transitions(path), or save agents with include=['transitions']."
             )
-        with fit_progress(progress_bar) as progress:
+        with agent.policy.lock, fit_progress(progress_bar) as progress:
             report = model.prune(agent.transitions, fraction, seed=agent._planning_seed, progress=progress, config=config)
-        agent._n_updates += 1
-        agent.fit_report = report
-        agent._refresh()
+            agent._n_updates += 1
+            agent.fit_report = report
+            agent._refresh()
         if hasattr(agent, "_logger"):  # a loaded agent has none before it learns
             log_fit(agent.logger, report, agent._n_updates, len(agent.transitions), len(agent.policy.start_states))
         return self

@@ -123,18 +123,19 @@ class SavableAlgorithm(BaseAlgorithm):
         if not isinstance(params, Mapping):
             params = {"policy": persistence.read(params)[1]["policy"]}
         agent = cast("ModelLearningAgent", self)
-        before = agent.policy.parts()
-        try:
-            weights = params.get("policy", {})
-            agent._recode(agent.policy.factored.from_value_arrays({k: np.asarray(v) for k, v in dict(weights).items()}))
-            super().set_parameters(dict(params), exact_match, device)
-        except Exception:
-            if before[0] is not agent.policy.factored:
-                agent.policy.recode(*before)
-                agent.goals.recode()
-                agent._refresh()
-            raise
-        agent._refresh()
+        with agent.policy.lock:
+            before = agent.policy.parts()
+            try:
+                weights = params.get("policy", {})
+                agent._recode(agent.policy.factored.from_value_arrays({k: np.asarray(v) for k, v in dict(weights).items()}))
+                super().set_parameters(dict(params), exact_match, device)
+            except Exception:
+                if before[0] is not agent.policy.factored:
+                    agent.policy.recode(*before)
+                    agent.goals.recode()
+                    agent._refresh()
+                raise
+            agent._refresh()
 
     def save_transitions(self, path: Target) -> None:
         """Writes what was experienced as an ``.npz`` of plain arrays (see TransitionDataset.save, also for what it raises)."""
@@ -168,13 +169,15 @@ def _save(agent: ModelLearningAgent, target: Target, include: Sequence[str]) -> 
         )
     if not isinstance(agent.exploration_name, str):
         raise ValueError("This agent's exploration is an object, which a file cannot rebuild; pass it by name.")
-    if agent.policy.fitted:
-        agent.goals.fit_learned()
-    arrays = {"policy": agent.policy.arrays(), "planning": {"start_states": agent.policy.start_states}}
-    if "transitions" in include:
-        rows = agent.experience.dataset.rows()
-        arrays["transitions"] = {name: getattr(rows, name) for name in rows.__dataclass_fields__}
-    persistence.write(target, _data(agent), arrays)
+    with agent.policy.lock:
+        if agent.policy.fitted:
+            agent.goals.fit_learned()
+        arrays = {"policy": agent.policy.arrays(), "planning": {"start_states": agent.policy.start_states}}
+        if "transitions" in include:
+            rows = agent.experience.dataset.rows()
+            arrays["transitions"] = {name: getattr(rows, name) for name in rows.__dataclass_fields__}
+        data = _data(agent)
+    persistence.write(target, data, arrays)
 
 
 def _data(agent: ModelLearningAgent) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent import files
+from mbagent.locks import Lock
 
 _COLUMNS = ("states", "actions", "next_states", "terminated", "rewards", "episodes")
 _KEPT = ("before", "actions", "after", "terminated", "rewards", "episodes")
@@ -103,6 +104,7 @@ class TransitionDataset:
         self.cardinalities = tuple(int(c) for c in self.cardinalities)
         if self.folder is not None:
             self._chunks = [_begun(Path(self.folder), self.cardinalities, self.n_actions, self.kind)]
+        self._lock = Lock()  # rows that one thread adds while another merges the others must not be lost
 
     @property
     def kind(self) -> np.dtype[Any]:
@@ -125,10 +127,13 @@ class TransitionDataset:
             ValueError: states of another width, or values or actions out of range.
         """
         self._check(batch)
-        narrow = batch.narrowed(self.kind)
+        with self._lock:
+            self._add(batch.narrowed(self.kind))
+
+    def _add(self, narrow: TransitionBatch) -> None:
         if self.folder is None:
             self._chunks.append(narrow)
-        elif len(batch):
+        elif len(narrow):
             folder, n_factors = Path(self.folder), len(self.cardinalities)
             with _locked(folder):
                 if len(_mapped(folder, n_factors, self.kind)) != len(self):
@@ -172,9 +177,10 @@ class TransitionDataset:
                 f"These transitions have {len(other.cardinalities)} factors and {other.n_actions} actions, this dataset "
                 f"{len(self.cardinalities)} and {self.n_actions}; they come from another environment."
             )
-        rows, own = other.rows(), self.rows().episodes
-        first = int(own.max()) + 1 if len(own) else 0
-        self.append(replace(rows, episodes=rows.episodes + first))
+        with self._lock:
+            rows, own = other.rows(), self.rows().episodes
+            first = int(own.max()) + 1 if len(own) else 0
+            self.append(replace(rows, episodes=rows.episodes + first))
 
     def rows(self) -> TransitionBatch:
         """All rows as one batch, in the order met."""
@@ -182,10 +188,11 @@ class TransitionDataset:
             n = len(self.cardinalities)
             ints, none = np.zeros((0, n), dtype=self.kind), np.zeros(0, dtype=np.int64)
             return TransitionBatch(ints, none, ints, none.astype(np.bool_), none.astype(np.float64), none)
-        if len(self._chunks) > 1:
-            merged = (np.concatenate([getattr(chunk, name) for chunk in self._chunks]) for name in _KEPT)
-            self._chunks = [TransitionBatch(*merged)]
-        return self._chunks[0]
+        with self._lock:
+            if len(self._chunks) > 1:
+                merged = (np.concatenate([getattr(chunk, name) for chunk in self._chunks]) for name in _KEPT)
+                self._chunks = [TransitionBatch(*merged)]
+            return self._chunks[0]
 
     def split(self, fraction: float, seed: int, min_episodes: int = 10) -> tuple[TransitionBatch, TransitionBatch]:
         """Splits into training and validation rows by whole episodes, so that no row's neighbour leaks across.

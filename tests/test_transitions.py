@@ -1,7 +1,9 @@
 """Rows in memory and in files: narrow, whole, and refused where they are of another world."""
 
+import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -132,3 +134,21 @@ def test_a_file_or_half_a_folder_is_no_folder_of_transitions(tmp_path: Path) -> 
     (tmp_path / "rows" / "rewards.bin").unlink()
     with pytest.raises(ValueError, match=r"lacks rewards\.bin"):
         TransitionDataset.load(tmp_path / "rows")
+
+
+def test_rows_that_are_added_while_another_thread_reads_are_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    data, merge = TransitionDataset(CARDINALITIES, 4), np.concatenate
+    adding = threading.Thread(target=lambda: data.append(batch(3)))
+
+    def slowly(parts: Any) -> Any:
+        if adding.ident is None:  # in the middle of the first merge
+            adding.start()
+            adding.join(0.1)
+        return merge(parts)
+
+    data.append(batch(5))
+    data.append(batch(7))
+    monkeypatch.setattr(np, "concatenate", slowly)
+    assert len(data.rows()) == 12
+    adding.join()
+    assert len(data.rows()) == 15

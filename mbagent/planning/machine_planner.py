@@ -70,9 +70,9 @@ class MachinePlanner:
 
     def set_goal(self, goal: Goal) -> None:
         """See Planner. The machine stays, its values go."""
-        self._goal, self._way, self._told = goal, None, False
         if self._machine is not None:
-            self._machine.values = None
+            self._machine.values = None  # before the goal changes: an interrupt must not leave values of another one
+        self._goal, self._way, self._told = goal, None, False
 
     def look_ahead_as(self, other: MachinePlanner) -> None:
         """Takes over how another planner of the same model and goal looks ahead, if that has found out."""
@@ -153,17 +153,14 @@ class MachinePlanner:
         if self._way is None:
             settings, start = self.settings, self._start
             usual = Way(LOWEST_KNOWN, settings.lookahead_states, settings.lookahead_samples)
-            self._way = usual
             if settings.learn_values and start is not None and len(start):
-                self._way = self._rehearse(
-                    usual, Task(self._known_model(), self._known_goal(), start, settings.gamma, settings.seed)
-                )
+                usual = self._rehearse(usual, Task(self._known_model(), self._known_goal(), start, settings.gamma, settings.seed))
+            self._way = usual
         return self._way
 
     def _rehearse(self, usual: Way, task: Task) -> Way:
         """Learns values for the goal, and finds out whether plans are best with them at the edge, without or only with them."""
         settings = self.settings
-        self._way = None  # should the goal fail now, it is tried again
         leaf, met = learn_values(task)
         if len(leaf.common) == 0:
             return usual
@@ -172,11 +169,11 @@ class MachinePlanner:
             self._way = way
             return best_actions(self._imagine(states).scores)
 
-        self.settings = replace(settings, **REHEARSED)
         try:
+            self.settings = replace(settings, **REHEARSED)
             ways = (usual._replace(leaf=leaf), usual, Way(leaf, 1, settings.n_samples))
             return best_way(replace(task, start=met), ways, act)
-        finally:
+        finally:  # should the goal fail now, it is tried again
             self.settings, self._way = settings, None
 
     def _solved_machine(self) -> Machine:
