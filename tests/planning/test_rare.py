@@ -102,7 +102,7 @@ def test_a_jackpot_of_less_than_one_percent_is_worth_its_mean() -> None:
     zeros = np.zeros((3, 1), dtype=np.int64)
     means = [rows.rewards[rows.actions == a].mean() for a in range(3)]
     assert agent.policy.reward_model(zeros, np.arange(3), zeros) == pytest.approx(means, abs=0.05)
-    assert int(agent.predict(0)[0]) == 1
+    assert int(agent.predict(np.array(0))[0]) == 1
 
 
 def blinking(n_bits: int) -> DecisionGraphModel:

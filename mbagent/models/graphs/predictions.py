@@ -158,9 +158,10 @@ class GraphPredictions(BaseTransitionModel):
             some = np.flatnonzero((n_events == n) & (rates < 1.0))
             found = self._successors(states[some], actions[some], planned.usual, planned.late, max(1, n_samples - int(n)), seed)
             parts.append((some, 1.0 - rates[some], found))
-            some = np.flatnonzero((n_events == n) & (rates > 0.0))
-            found = self._successors(states[some], actions[some], planned.event, late, int(n), seed)
-            parts.append((some, rates[some], found))
+            if n > 0:
+                some = np.flatnonzero(n_events == n)
+                found = self._successors(states[some], actions[some], planned.event, late, int(n), seed)
+                parts.append((some, rates[some], found))
         return mixed(parts, len(states))
 
     def _successors(

@@ -10,7 +10,7 @@ from tests.models.helpers import dataset
 RISK = 0.004
 
 
-def machine(n: int, n_coins: int, seed: int, ends: bool = True, risk: float = RISK) -> tuple[np.ndarray, ...]:
+def machine(n: int, n_coins: int, seed: int, ends: bool = True, risk: float = RISK) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Gear 0 ... 2, whether it is broken, and coins that fall anew at every step; action 1 shifts up and may break it."""
     rng = np.random.default_rng(seed)
     gear, action = rng.integers(3, size=n), rng.integers(2, size=n)
