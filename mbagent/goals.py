@@ -13,6 +13,7 @@ from mbagent.experience import Experience
 from mbagent.learned_reward import RewardReport
 from mbagent.planning.goal import Goal
 from mbagent.policies import PlannerPolicy
+from mbagent.reward_changes import wrong_until
 from mbagent.rewards import GivenReward, RewardFn
 from mbagent.subprocesses import own_reward
 from mbagent.transitions import TransitionDataset
@@ -165,6 +166,14 @@ class GoalBook:
             return f"The environment's reward_fn fails on its own observations ({type(cause).__name__}: {str(cause).rstrip('.')})"
         wrong = ~np.isclose(rewards, rows.rewards, rtol=1e-4, atol=1e-6)
         if wrong.any():
+            until = wrong_until(rows, wrong)
+            if until is not None:
+                self._tell(
+                    f"The environment's rewards changed after about {until:,} steps, and its reward_fn gives those observed "
+                    "since then, so the agent plans with it; when you change rewards, give the new goal with set_reward(fn), or "
+                    "call set_env(env), which starts the rewards afresh."
+                )
+                return None
             return f"The environment's reward_fn differs from {int(wrong.sum())} of the {len(rows)} rewards met"
         return None
 

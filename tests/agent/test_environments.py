@@ -1,5 +1,6 @@
 """What an environment does wrong is called the environment's mistake, in one sentence, and costs nothing that was learned."""
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -173,3 +174,37 @@ def test_a_reward_fn_that_is_no_reward_function_is_named_and_the_reward_is_learn
         agent.learn(300, log_interval=None)
     assert agent.goals.source == "learned"
     assert int(agent.predict(np.array(3))[0]) == 1
+
+
+class Seeker(Corridor):
+    """A corridor without an end that pays 1 at a cell, which can be changed; with or without a ``reward_fn`` that knows it."""
+
+    def __init__(self, knows: bool) -> None:
+        super().__init__(limit=20)
+        self.goal = 1
+        if knows:
+            self.reward_fn = lambda obs, action, next_obs: (next_obs == self.goal) * 1.0
+
+    def set_goal(self, goal: int) -> None:
+        self.goal = goal
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+        obs, _, _, truncated, info = super().step(action)
+        return obs, float(obs == self.goal), False, truncated, info
+
+
+@pytest.mark.parametrize(("knows", "source"), [(False, "learned"), (True, "environment")])
+def test_plans_follow_rewards_that_change_while_learning_goes_on(knows: bool, source: str) -> None:
+    agent = ModelLearningAgent("MctsPolicy", Seeker(knows), seed=0, model="tabular")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "The environment has no reward_fn")
+        agent.learn(1500, log_interval=None)
+        assert int(agent.predict(np.array(2))[0]) == 0
+        agent.get_env().env_method("set_goal", 3)  # type: ignore[union-attr]
+        with pytest.warns(UserWarning, match=r"The environment's rewards changed after about 1,5\d\d steps.* set_env"):
+            agent.learn(800, log_interval=None)
+        assert int(agent.predict(np.array(2))[0]) == 1
+        assert agent.goals.source == source
+        agent.set_env(agent.get_env())  # type: ignore[arg-type]
+        agent.learn(400, log_interval=None)  # rewards are those observed since, and there is nothing to warn of
+    assert int(agent.predict(np.array(2))[0]) == 1

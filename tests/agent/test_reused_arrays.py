@@ -24,6 +24,7 @@ class Switches(gym.Env[Any, Any]):
     def __init__(self, kind: str = "array", limit: int | None = None, copies: bool = False, infos: bool = False) -> None:
         self.on, self.count = np.zeros(N, np.int8), np.zeros(1, np.int64)
         self.info: dict[str, Any] = {}
+        self.shown: Any
         self.limit, self.copies, self.infos = limit, copies, infos
         bits, number = spaces.MultiBinary(N), spaces.MultiDiscrete([N + 1])
         self.observation_space, self.shown = {
