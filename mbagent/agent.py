@@ -16,10 +16,13 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv
 
 from mbagent.arguments import (
+    check_callback,
+    check_count,
+    check_device,
     check_exploration,
     check_learning_rate,
-    check_log_interval,
     check_model,
+    check_policy,
     check_seed,
     check_timesteps,
     fitting_model,
@@ -34,7 +37,7 @@ from mbagent.models.base import FitReport, TransitionModel
 from mbagent.models.factory import build_model
 from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
 from mbagent.pruned import PrunableAlgorithm
-from mbagent.reporting import fit_progress, log_fit, log_rollout
+from mbagent.reporting import check_progress, fit_progress, log_fit, log_rollout
 from mbagent.rewards import RewardFn
 from mbagent.spaces import ActionEnumeration, FactoredSpace
 from mbagent.subprocesses import ENDED, has_ended, naming_ended_processes, step
@@ -121,14 +124,14 @@ class ModelLearningAgent(PrunableAlgorithm):
         """See the class."""
         seed = check_seed(seed)
         super().__init__(
-            policy,
+            check_policy(policy, self.policy_aliases),
             env,
             learning_rate,
             policy_kwargs=policy_kwargs,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             verbose=verbose,
-            device="cpu" if device == "auto" else device,
+            device=check_device(device),
             support_multi_env=True,
             seed=seed,
         )
@@ -276,13 +279,20 @@ class ModelLearningAgent(PrunableAlgorithm):
             progress_bar: shows one (needs ``pip install "mbagent[progress]"``).
 
         Raises:
+            TypeError, ValueError, ImportError: an argument is none of these; there is no environment, or nothing to fit; a
+                package for the progress bar is missing. No step is taken then.
+            TypeError, ValueError: the environment returned something else than it declares.
             RuntimeError: a process of a SubprocVecEnv has ended. After this or any other error the steps recorded so far are
                 kept: ``learn(0)`` fits to them without using the environment; ``learn`` with more steps begins with a reset.
         """
         if self.env is None:
             raise ValueError("learn() needs an environment; give one with set_env(env) or load(path, env=env).")
         fresh_start = reset_num_timesteps or self._last_obs is None or self._recorder is None
-        steps, log_interval = check_timesteps(total_timesteps), check_log_interval(log_interval)
+        steps, log_interval = check_timesteps(total_timesteps), check_count("log_interval", log_interval, "no log")
+        check_callback(callback)
+        check_progress(progress_bar)
+        if not steps and not len(self.experience.dataset):
+            raise ValueError("learn(0) only fits the transitions collected so far, and there are none; ask for steps.")
         total, callbacks = self._setup_learn(steps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if self._recorder is None or (fresh_start and self._last_obs is not None):
             self._recorder = ExperienceRecorder(self.experience.space, self.experience.dataset, self.n_envs)
@@ -303,6 +313,7 @@ class ModelLearningAgent(PrunableAlgorithm):
         finally:  # an interrupted run keeps what it met: learn(0) fits to it
             self._recorder.flush()
         if len(self.experience.dataset):
+            self._recorder.warn_of_reused_arrays()
             with self.policy.lock, self._undone_on_error():
                 self._fit(self._recorder, progress_bar)
             if log_interval is not None:

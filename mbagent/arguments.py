@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
 
 from mbagent.exploration import EXPLORATIONS, Exploration
 from mbagent.models.base import TransitionModel
@@ -34,9 +36,11 @@ def planner_settings(own: Mapping[str, Any], policy_kwargs: Mapping[str, Any], s
     """The agent's own settings of the planner and those of ``policy_kwargs``.
 
     Raises:
-        TypeError: there is no setting of that name.
+        TypeError: it is no dict, or there is no setting of that name.
         ValueError: one is out of range.
     """
+    if not isinstance(policy_kwargs, Mapping):
+        raise TypeError(f"policy_kwargs must be a dict of planner settings, got {policy_kwargs!r}.")
     known = sorted(set(PlannerSettings.__dataclass_fields__) - {*own, "seed"})
     unknown = sorted(set(policy_kwargs) - set(known))
     if unknown:
@@ -61,13 +65,40 @@ def check_timesteps(total: Any) -> int:
     return int(total)
 
 
-def check_log_interval(interval: Any) -> int | None:
-    """``log_interval`` as an int of at least 1, or None."""
-    if interval is None:
+def check_count(name: str, count: Any, none: str) -> int | None:
+    """An argument that is a number of at least 1, as an int; or None, which means ``none``."""
+    if count is None:
         return None
-    if isinstance(interval, bool) or not isinstance(interval, int | np.integer) or interval < 1:
-        raise ValueError(f"log_interval must be a whole number of at least 1, or None for no log, got {interval!r}.")
-    return int(interval)
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+        raise ValueError(f"{name} must be a whole number of at least 1, or None for {none}, got {count!r}.")
+    return int(count)
+
+
+def check_callback(callback: Any) -> None:
+    """The ``callback`` argument: one of SB3's, a list of these, a function of (locals, globals), or None."""
+    for each in callback if isinstance(callback, list) else [callback]:
+        if not (isinstance(each, BaseCallback) or (each is callback and (each is None or callable(each)))):
+            raise TypeError(
+                "callback must be a BaseCallback of SB3, a list of these, a function of (locals, globals) or None, "
+                f"got {callback!r}."
+            )
+
+
+def check_device(device: Any) -> torch.device | str:
+    """The ``device`` argument; "auto" is the processor."""
+    try:
+        return "cpu" if device == "auto" else torch.device(device)
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(
+            f"device must be 'auto', 'cpu' or another device that torch knows, such as 'cuda', got {device!r}."
+        ) from error
+
+
+def check_policy(policy: Any, known: Iterable[str]) -> Any:
+    """The ``policy`` argument: a known name or a class."""
+    if policy in known if isinstance(policy, str) else isinstance(policy, type):
+        return policy
+    raise ValueError(f"policy must be one of {sorted(known)}, or a subclass of PlannerPolicy, got {policy!r}.")
 
 
 def check_learning_rate(rate: Any) -> float:

@@ -9,12 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.base import Actions, States
-from mbagent.policies import as_batch
+from mbagent.models.base import Actions, States, hash_rows
+from mbagent.policies import one_as_batch
 from mbagent.spaces import FactoredSpace
 from mbagent.transitions import TransitionBatch, TransitionDataset
+from mbagent.wrapping import blaming_environment
 
 _FLUSH = 256
+
+CHANCE = 1e-3
+"""Episodes that all end where the next one starts are reported from this probability on that they do by chance."""
 
 
 class Experience:
@@ -73,6 +77,7 @@ class ExperienceRecorder:
         self._space, self._dataset = space, dataset
         self._steps: list[TransitionBatch] = []
         self._starts: list[States] = []
+        self._ends_at_starts = True
         rows = dataset.rows().episodes
         self._next_episode = int(rows.max()) + 1 if len(rows) else 0
         self._episodes = np.zeros(n_envs, dtype=np.int64)
@@ -80,7 +85,8 @@ class ExperienceRecorder:
 
     def reset(self, obs: Any) -> None:
         """Every environment starts a new episode at ``obs`` (batched)."""
-        self.states = self._space.encode(obs)
+        with blaming_environment():
+            self.states = self._space.encode(obs)
         self._begin(np.arange(len(self.states)))
 
     def _begin(self, which: NDArray[np.int64]) -> None:
@@ -113,27 +119,31 @@ class ExperienceRecorder:
                 "The environment returned a reward of NaN or infinity, or one beyond 3.4e38, which is more than the float32 of "
                 "vector environments can hold; mend the environment or wrap its rewards."
             )
-        following = self._space.encode(new_obs)
-        next_states = following
-        ended = np.flatnonzero(dones)
-        terminated = np.array(dones, dtype=np.bool_)
-        if len(ended):
-            next_states = following.copy()
+        ended, terminated = np.flatnonzero(dones), np.array(dones, dtype=np.bool_)
+        with blaming_environment():
+            following = self._space.encode(new_obs)
+            next_states = following.copy() if len(ended) else following
             for i in ended:
-                last, _ = as_batch(self._space.space, infos[i]["terminal_observation"])
-                next_states[i] = self._space.encode(last)[0]
+                last = infos[i].get("terminal_observation")
+                if last is None:
+                    raise ValueError(
+                        f"The vector environment ended an episode without infos[{i}]['terminal_observation'], as SB3's have it; "
+                        "add it, or make the environment's step return a new info dict each time."
+                    )
+                next_states[i] = self._space.encode(one_as_batch(self._space.space, last))[0]
                 terminated[i] = not infos[i].get("TimeLimit.truncated", False)
         step = TransitionBatch(
             self.states,
             actions.astype(np.int64),
             next_states,
             terminated,
-            np.asarray(rewards, dtype=np.float64),
+            np.array(rewards, dtype=np.float64),  # copied: the vector environment may use its arrays again
             self._episodes.copy(),
         )
         self._steps.append(step)
         self.states = following
         if len(ended):
+            self._ends_at_starts &= np.array_equal(next_states[ended], following[ended])
             self._begin(ended)
         if len(self._steps) >= _FLUSH:
             self.flush()
@@ -145,6 +155,26 @@ class ExperienceRecorder:
             names = ("states", "actions", "next_states", "terminated", "rewards", "episodes")
             self._dataset.append(TransitionBatch(*(np.concatenate([getattr(s, n) for s in self._steps]) for n in names)))
             self._steps = []
+
+    def warn_of_reused_arrays(self) -> None:
+        """Warns, once, where last observations of episodes seem to be overwritten by the resets that follow.
+
+        That is so where all of them are the next episode's first, which is improbable by how often that one is observed.
+        """
+        if not self._ends_at_starts or len(self._starts) < 2:
+            return
+        observed, starts = np.sort(hash_rows(self._dataset.rows().states)), hash_rows(np.concatenate(self._starts[1:]))
+        counts = np.searchsorted(observed, starts, side="right") - np.searchsorted(observed, starts, side="left")
+        if np.log(np.maximum(counts, 1) / len(observed)).sum() > np.log(CHANCE):
+            return
+        self._ends_at_starts = False
+        warnings.warn(
+            f"All {len(starts)} episodes so far ended with the observation that the next one starts with, so the environment "
+            "probably returns an array that its reset overwrites; make its step and reset return copies (return obs.copy()), or "
+            "ignore this if its episodes do end where they start.",
+            UserWarning,
+            stacklevel=3,
+        )
 
     def starts(self) -> States:
         """Distinct start states met so far, int64 [S, F], in the order met."""

@@ -13,6 +13,7 @@ from mbagent.experience import Experience
 from mbagent.learned_reward import RewardReport
 from mbagent.planning.goal import Goal
 from mbagent.policies import PlannerPolicy
+from mbagent.reward_changes import wrong_until
 from mbagent.rewards import GivenReward, RewardFn
 from mbagent.subprocesses import own_reward
 from mbagent.transitions import TransitionDataset
@@ -55,8 +56,7 @@ class GoalBook:
         self._custom: GivenReward | None = None
         self._environment: GivenReward | None = None
         self._since = 0
-        self._has_environment = False
-        self._no_function = ""
+        self._unusable = "There is no environment"
         self._changes_rewards: str | None = None
         self._told: str | None = None
         self.source: Source = "environment"
@@ -65,9 +65,13 @@ class GoalBook:
 
     def take_environment(self, env: VecEnv) -> None:
         """Takes the ``reward_fn`` of a new environment, if it has one."""
-        self._since, self._has_environment = len(self._experience.dataset), True
-        fn, self._no_function = own_reward(env)
-        self._environment = self._given(fn) if callable(fn) else None
+        self._since, self._environment = len(self._experience.dataset), None
+        fn, self._unusable = own_reward(env)
+        if fn is not None:
+            try:
+                self._environment = self._given(fn)
+            except TypeError as error:  # something else that happens to have that name
+                self._unusable = f"The environment's reward_fn cannot be used as a goal ({str(error).rstrip('.')})"
         self._changes_rewards, self._told = reward_wrapper(env), None
 
     @property
@@ -152,16 +156,24 @@ class GoalBook:
     def _environment_problem(self) -> str | None:
         """Why the environment's own reward function cannot be used, or None."""
         if self._environment is None:
-            return self._no_function if self._has_environment else "There is no environment"
+            return self._unusable
         rows = self._transitions.rows()
         rows = rows.select(np.arange(self._since, len(rows)))
         try:
             rewards = self._environment(rows.states, rows.actions, rows.next_states)
         except Exception as error:
             cause = error.__cause__ or error
-            return f"The environment's reward_fn does not take its observations ({type(cause).__name__}: {cause})"
+            return f"The environment's reward_fn fails on its own observations ({type(cause).__name__}: {str(cause).rstrip('.')})"
         wrong = ~np.isclose(rewards, rows.rewards, rtol=1e-4, atol=1e-6)
         if wrong.any():
+            until = wrong_until(rows, wrong)
+            if until is not None:
+                self._tell(
+                    f"The environment's rewards changed after about {until:,} steps, and its reward_fn gives those observed "
+                    "since then, so the agent plans with it; when you change rewards, give the new goal with set_reward(fn), or "
+                    "call set_env(env), which starts the rewards afresh."
+                )
+                return None
             return f"The environment's reward_fn differs from {int(wrong.sum())} of the {len(rows)} rewards met"
         return None
 

@@ -8,8 +8,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent.arguments import check_count
 from mbagent.models.base import Actions, States
-from mbagent.policies import NO_GOAL, as_batch
+from mbagent.policies import NO_GOAL, PlannerPolicy, as_batch
 from mbagent.rewards import GivenReward, RewardFn
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class LearnedEnv(gym.Env[Any, Any]):
 
     Raises:
         ValueError: the agent has learned nothing yet, or there is no reward; or a limit below 1.
-        TypeError: the reward is no function of (obs, action, next_obs).
+        TypeError: the agent is none; or the reward is no function of (obs, action, next_obs).
 
     Example:
         agent = mbagent.ModelLearningAgent("MctsPolicy", env, seed=0).learn(20_000)
@@ -50,6 +51,8 @@ class LearnedEnv(gym.Env[Any, Any]):
         self, agent: ModelLearningAgent, reward_fn: RewardFn | None = None, *, max_episode_steps: int | None = None
     ) -> None:
         """See the class."""
+        if not isinstance(getattr(agent, "policy", None), PlannerPolicy):
+            raise TypeError(f"LearnedEnv needs an agent, a ModelLearningAgent that has learned, got {agent!r}.")
         with agent.policy.lock:
             self._take(agent, reward_fn, max_episode_steps)
 
@@ -57,8 +60,7 @@ class LearnedEnv(gym.Env[Any, Any]):
         policy = agent.policy
         if not policy.fitted:
             raise ValueError("This agent has learned nothing yet, so there is no world to have back; call learn() first.")
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise ValueError(f"max_episode_steps must be at least 1, or None for no limit, got {max_episode_steps}.")
+        max_episode_steps = check_count("max_episode_steps", max_episode_steps, "no limit")
         if reward_fn is None and policy.goal is None:
             raise ValueError(NO_GOAL)
         self.observation_space, self.action_space = agent.observation_space, agent.action_space
@@ -84,10 +86,17 @@ class LearnedEnv(gym.Env[Any, Any]):
         return self._shown(self._state), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """See gymnasium.Env."""
+        """See gymnasium.Env.
+
+        Raises:
+            ResetNeeded: ``reset`` was not called.
+            ValueError: the action is not one of the action space.
+        """
         if self._state is None:
             raise gym.error.ResetNeeded("Call reset() before step().")
-        actions = self._actions.encode(as_batch(self.action_space, action)[0])
+        actions = self._actions.encode(as_batch(self.action_space, action, "action")[0])
+        if len(actions) != 1:
+            raise ValueError(f"LearnedEnv.step takes one action, got a batch of {len(actions)}.")
         following, over = self.model.sample(self._state, actions, self.np_random.integers(2**64, size=1, dtype=np.uint64))
         reward = self._earned(self._state, actions, following)
         self._state, self._steps = following, self._steps + 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mbagent.models.base import Actions, Floats, States, hash_rows
+from mbagent.models.base import Actions, Floats, States
 from mbagent.models.graphs.transition_classes import ClassGraphs, cells_in, check_graphs, class_chances, learn_classes
 from mbagent.models.networks import Affine, FactorCodec
 from mbagent.models.planes import Convolution, cells_of
 from mbagent.models.reward_kernel import DenseReward, pack_reward, reward_outputs
 from mbagent.models.training import one_thread
+from mbagent.reward_changes import still_hold, triples, turn
 from mbagent.spaces import PlaneLayout
 from mbagent.transitions import TransitionBatch
 
@@ -51,16 +52,25 @@ class RewardReport:
         right: share of transitions whose reward comes out within 0.5% of the range.
         held_out: the same of episodes that were held out at first, as measured then; NaN where there are none.
         contrary: share of transitions that had another reward than most with the same (observation, action, next observation).
+        since: after how many transitions rewards changed, for the last time; 0 where they did not. The other figures are then of
+            the transitions whose rewards hold now.
     """
 
     n_values: int
     right: float
     held_out: float
     contrary: float
+    since: int = 0
 
     @property
     def advice(self) -> str | None:
         """What a user should know, in a sentence; None where all is well."""
+        if self.since:
+            return (
+                f"The environment's rewards changed after about {self.since:,} steps, so the agent plans with those observed "
+                "since then; when you change rewards, give the new goal with set_reward(fn), or call set_env(env), which starts "
+                "the rewards afresh."
+            )
         if self.contrary > CONTRARY:
             return (
                 f"{self.contrary:.1%} of rewards differ from what the same observation, action and next observation earned "
@@ -115,7 +125,16 @@ class LearnedReward:
 
     @one_thread()
     def fit(self, rows: TransitionBatch) -> RewardReport:
-        """Learns from rows: from most episodes first, to see how it does on the others, and then from all."""
+        """Learns from rows, in the order observed; where rewards changed, from those that hold now."""
+        report = self._learn(rows)
+        if report.right < 1.0 or report.held_out < 1.0:  # else no rows contradict each other
+            since, hold = self._changed(rows)
+            if since:
+                report = replace(self._learn(rows.select(hold)), since=since)
+        return report
+
+    def _learn(self, rows: TransitionBatch) -> RewardReport:
+        """Learns from most episodes first, to see how it does on the others, and then from all."""
         values = np.unique(rows.rewards)
         self._classes = len(values) <= MAX_CLASSES
         self._values = values if self._classes else np.array([values.mean(), max(values.std(), 1e-6)])
@@ -180,13 +199,71 @@ class LearnedReward:
 
     def _as_graphs(self, rows: TransitionBatch) -> ClassGraphs | None:
         """Decision graphs for the rewards of some rows; None where there are too many different ones."""
-        if not self._classes or len(self._values) > MAX_GRAPHS:
+        if not self._few:
             return None
+        graphs, order = self._class_graphs(rows)
+        self._order = self._values[order]
+        return graphs
+
+    @property
+    def _few(self) -> bool:
+        """Whether there are few enough rewards for graphs."""
+        return self._classes and len(self._values) <= MAX_GRAPHS
+
+    def _class_graphs(self, rows: TransitionBatch) -> tuple[ClassGraphs, NDArray[np.int64]]:
+        """Decision graphs for the rewards of some rows, and which reward each class is, the commonest first."""
         number = np.searchsorted(self._values, rows.rewards)
         common = int(np.bincount(number, minlength=len(self._values)).argmax())
         order = np.concatenate([[common], np.delete(np.arange(len(self._values)), common)])
-        self._order = self._values[order]
-        return learn_classes(rows, np.argsort(order)[number], self._codec.cardinalities, self._parts, self._planes)
+        return learn_classes(rows, np.argsort(order)[number], self._codec.cardinalities, self._parts, self._planes), order
+
+    def _chances(self, train: TransitionBatch, rows: TransitionBatch) -> Floats:
+        """Probability [N, K] of each reward, as graphs learned from some rows tell them of others."""
+        graphs, order = self._class_graphs(train)
+        parts = (np.ascontiguousarray(part) for part in (rows.states, rows.actions, rows.next_states))
+        return class_chances(graphs, len(order), *parts)[:, np.argsort(order)]
+
+    # ------------------------------------------------------------------ changes
+
+    def _changed(self, rows: TransitionBatch) -> tuple[int, NDArray[np.int64]]:
+        """After how many rows rewards changed for the last time, 0 for never, and which rows tell of them as they are now."""
+        order = np.argsort(rows.episodes, kind="stable")  # episode by episode, where several environments take turns
+        rows = rows.select(order)
+        keys, values, since = triples(rows), self._numbers(rows.rewards), 0
+        while found := self._turn(rows.select(slice(since, None)), keys[since:], values[since:]):
+            since += found
+        if not since:
+            return 0, order
+        hold = np.arange(len(rows)) >= since
+        if self._few:  # what was not observed again since holds, unless it is like something whose reward is another now
+            old, new = (self._chances(rows.select(part), rows) for part in (~hold, hold))
+            cells = np.unique(np.concatenate([old, new], axis=1), axis=0, return_inverse=True)[1].ravel()
+            hold[:since] = still_hold(cells, values, since) & ~np.isin(keys[:since], keys[since:])
+        return since, np.sort(order[hold])
+
+    def _numbers(self, rewards: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Numbers of rewards; where there are very many, those of like ones are the same."""
+        if self._classes:
+            return np.searchsorted(self._values, rewards)
+        return np.searchsorted(np.quantile(rewards, np.arange(1, MAX_GRAPHS) / MAX_GRAPHS), rewards)
+
+    def _turn(self, rows: TransitionBatch, keys: NDArray[np.int64], values: NDArray[np.int64]) -> int:
+        """The row from which on rewards are others than before, or 0."""
+        found = turn(keys, values, rows.episodes)
+        half = len(rows) // 2
+        if found or not self._few or np.isin(keys[half:], keys[:half]).mean() > 0.5:
+            return found
+        # Transitions that hardly ever come back are alike where graphs say the same of them; a covariate shift could look like a
+        # change then, so the rows since must predict better, too.
+        chances = self._chances(rows, rows)
+        found = turn(np.unique(chances, axis=0, return_inverse=True)[1].ravel(), values, rows.episodes)
+        if not found:
+            return 0
+        tested = (np.arange(len(rows)) >= found) & (np.arange(len(rows)) % 3 == 0)
+        tests, known = rows.select(tested), [~tested, ~tested & (np.arange(len(rows)) >= found)]
+        errors = [(self._chances(rows.select(train), tests) @ self._values - tests.rewards) ** 2 for train in known]
+        gain = errors[0] - errors[1]
+        return found if gain.mean() > 2.0 * gain.std() / len(gain) ** 0.5 else 0
 
     def _errors(self, rows: TransitionBatch) -> Floats:
         """Squared errors [N]."""
@@ -314,9 +391,9 @@ def _distinct(rows: TransitionBatch) -> tuple[TransitionBatch, NDArray[np.float3
 
     A rare transition then counts as much as a frequent one, and a random reward keeps its distribution.
     """
-    triples, bits = _triples(rows), np.ascontiguousarray(rows.rewards).view(np.int64)
-    _, first, counts = np.unique(np.stack([triples, bits], axis=1), axis=0, return_index=True, return_counts=True)
-    _, inverse = np.unique(triples[first], return_inverse=True)
+    keys, bits = triples(rows), np.ascontiguousarray(rows.rewards).view(np.int64)
+    _, first, counts = np.unique(np.stack([keys, bits], axis=1), axis=0, return_index=True, return_counts=True)
+    _, inverse = np.unique(keys[first], return_inverse=True)
     shares = counts / np.bincount(inverse, weights=counts)[inverse]
     return rows.select(first), shares.astype(np.float32)
 
@@ -331,18 +408,13 @@ def _weighed(chances: Floats, values: Floats, floor: float = 0.0) -> Floats:
 
 def _numbered(rows: TransitionBatch) -> NDArray[np.int64]:
     """Numbers 0, 1, ... of the distinct (s, a, s'), int64 [N]."""
-    result: NDArray[np.int64] = np.unique(_triples(rows), return_inverse=True)[1]
+    result: NDArray[np.int64] = np.unique(triples(rows), return_inverse=True)[1]
     return result
-
-
-def _triples(rows: TransitionBatch) -> NDArray[np.int64]:
-    """A number for each (s, a, s')."""
-    return hash_rows(np.concatenate([rows.states, rows.actions[:, None], rows.next_states], axis=1)).view(np.int64)
 
 
 def _contrary(rows: TransitionBatch) -> float:
     """Share of rows with another reward than the commonest of the same (s, a, s')."""
-    bits = np.ascontiguousarray(rows.rewards, dtype=np.float64).view(np.int64)
-    pairs, counts = np.unique(np.stack([_triples(rows), bits], axis=1), axis=0, return_counts=True)
+    bits = np.ascontiguousarray(rows.rewards + 0.0, dtype=np.float64).view(np.int64)  # -0.0 is 0.0
+    pairs, counts = np.unique(np.stack([triples(rows), bits], axis=1), axis=0, return_counts=True)
     first = np.flatnonzero(np.r_[True, pairs[1:, 0] != pairs[:-1, 0]])
     return 1.0 - float(np.maximum.reduceat(counts, first).sum()) / len(rows.actions)

@@ -22,6 +22,23 @@ _WIDEST = 2**62
 Path = tuple[str | int, ...]
 
 
+class OutsideSpaceError(ValueError):
+    """A value that is not one of its space.
+
+    Args:
+        cause: what is wrong, as the beginning of a sentence.
+        remedy: what a caller who passed the value should do, as its end.
+
+    Attributes:
+        cause: as given; whoever knows that the value is not the caller's names another remedy.
+    """
+
+    def __init__(self, cause: str, remedy: str) -> None:
+        """See the class."""
+        super().__init__(f"{cause}; {remedy}.")
+        self.cause = cause
+
+
 @dataclass(frozen=True)
 class Leaf:
     """One elementary space: its path in the nested space and how its values become numbers.
@@ -56,28 +73,33 @@ class Leaf:
         """Numbers int64 [B, n] of a batch of the whole space.
 
         Raises:
-            ValueError: this part is missing, of another shape, or holds a value outside its space.
+            OutsideSpaceError: this part is missing, of another shape, or holds a value outside its space.
         """
         values = np.asarray(_descend(batch, self.path, kind))
         if values.shape[1:] != self.shape or values.ndim == 0:
-            raise ValueError(
+            raise OutsideSpaceError(
                 f"The {kind} batch{self.where} has shape {values.shape}, but {self.space} needs "
-                f"(batch, {', '.join(map(str, self.shape))}); pass a batch of {kind}s of the environment's space."
+                f"(batch, {', '.join(map(str, self.shape))})",
+                f"pass a batch of {kind}s of the environment's space",
             )
-        flat = values.reshape(len(values), len(self.cardinalities))
+        flat, own = values.reshape(len(values), len(self.cardinalities)), f"pass {kind}s of the environment's own space"
         if flat.dtype.kind not in "iub" and not np.array_equal(flat, np.floor(flat)):
-            raise ValueError(f"The {kind}{self.where} holds values that are not whole numbers; {self.space} has none.")
+            odd = flat[flat != np.floor(flat)][0]
+            raise OutsideSpaceError(f"The {kind}{self.where} holds the value {odd}, but {self.space} has whole numbers only", own)
         numbers = flat.astype(np.int64) - self.low
         outside = (numbers < 0) | (numbers >= np.asarray(self.cardinalities))
         if outside.any():
+            row, variable = np.argwhere(outside)[0]
+            holds = f"The {kind}{self.where} holds the value {flat[row, variable]}"
             if _WIDEST in self.cardinalities:
-                raise ValueError(
-                    f"The {kind}{self.where} holds the value {flat[outside][0]}; whole numbers are told apart from -2^61 to 2^61 "
-                    "only: make them smaller in a gymnasium.ObservationWrapper."
+                raise OutsideSpaceError(
+                    f"{holds}, but only whole numbers from -2^61 to 2^61 are told apart",
+                    "make them smaller in a gymnasium.ObservationWrapper",
                 )
-            raise ValueError(
-                f"The {kind}{self.where} holds the value {flat[outside][0]}, which lies outside {self.space}; "
-                f"pass {kind}s of the environment's own space."
+            low, at = int(self.low[variable]), np.unravel_index(variable, self.shape)
+            place = f" at index {list(map(int, at))}" if self.shape else ""
+            raise OutsideSpaceError(
+                f"{holds}{place}, which lies outside {self.space} ({low} to {low + self.cardinalities[variable] - 1})", own
             )
         return numbers
 
@@ -152,7 +174,7 @@ def _descend(batch: Any, path: Path, kind: str) -> Any:
     for key in path:
         missing = isinstance(batch, Mapping) and key not in batch
         if missing or not isinstance(batch, Mapping | Sequence):
-            raise ValueError(f"The {kind} batch has no part {key!r}; pass batched leaves for every part of the space.")
+            raise OutsideSpaceError(f"The {kind} batch has no part {key!r}", "pass batched leaves for every part of the space")
         batch = batch[key]  # type: ignore[index]  # a str for a Mapping, an int for a Sequence
     return batch
 

@@ -13,20 +13,31 @@ from stable_baselines3.common.utils import safe_mean
 from mbagent.models.base import FitReport
 
 
-@contextmanager
-def fit_progress(show: bool) -> Iterator[Callable[[float], None] | None]:
-    """A function to tell the share of a fit that is done, shown as a bar; None without ``show``.
+def check_progress(show: bool) -> None:
+    """Whether a progress bar can be shown, if one is asked for.
 
     Raises:
-        ImportError: tqdm is missing; the message names the pip line.
+        ImportError: a package is missing; the message names the pip line.
     """
+    if not show:
+        return
+    try:
+        import rich  # noqa: F401, PLC0415 - optional
+        import tqdm  # noqa: F401, PLC0415 - optional
+    except ImportError as error:
+        raise ImportError(
+            f'progress_bar=True needs the package {error.name}: pip install "mbagent[progress]", or learn without the bar.'
+        ) from error
+
+
+@contextmanager
+def fit_progress(show: bool) -> Iterator[Callable[[float], None] | None]:
+    """A function to tell the share of a fit that is done, shown as a bar; None without ``show``, see ``check_progress``."""
     if not show:
         yield None
         return
-    try:
-        from tqdm.auto import tqdm  # noqa: PLC0415 - optional
-    except ImportError as error:
-        raise ImportError('progress_bar=True needs tqdm: pip install "mbagent[progress]".') from error
+    from tqdm.auto import tqdm  # noqa: PLC0415 - optional
+
     with tqdm(total=100, desc="fitting the model", unit="%") as bar:
 
         def tell(share: float) -> None:

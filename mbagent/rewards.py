@@ -37,7 +37,8 @@ def _check_signature(fn: Any) -> None:
     try:
         signature.bind(None, None, None)
     except TypeError as error:
-        raise TypeError(f"A reward function is called as fn(obs, action, next_obs), but {fn!r} takes {signature}.") from error
+        name = getattr(fn, "__qualname__", repr(fn))
+        raise TypeError(f"A reward function is called as fn(obs, action, next_obs), but {name} takes {signature}.") from error
 
 
 LARGEST_REWARD = 1e100

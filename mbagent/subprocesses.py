@@ -76,9 +76,11 @@ def own_reward(env: VecEnv) -> tuple[Any, str]:
             return None, missing
         if alone or env.env_method("has_wrapper_attr", _IfPicklable("reward_fn"), indices=0)[0]:
             return env.get_attr("reward_fn", indices=0)[0], missing
-    except Exception:  # it has none, cannot be unpickled here, or the process has ended, which ``learn`` will tell
-        if alone:
+    except Exception as error:  # it has none, cannot be unpickled here, or the process has ended, which ``learn`` will tell
+        if alone and isinstance(error, AttributeError):
             return None, missing
+        if alone:  # an error of its own
+            return None, f"The environment's reward_fn cannot be read ({type(error).__name__}: {error})"
     return None, (
         "The environment's reward_fn cannot be pickled, as it must be to leave the environment's process (to plan with it, give "
         "the agent the function: reward=fn)"

@@ -1,18 +1,30 @@
 """What the documentation shows works."""
 
 import re
+import sys
+import tomllib
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import pytest
 
-PAGE = Path(__file__).parents[1] / "docs" / "environments.md"
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "environments.md"
 
 
-def blocks() -> list[str]:
+def blocks(page: Path = PAGE) -> list[str]:
     """The page's Python, but for what is marked not to be run."""
-    return re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+
+
+def optional_packages() -> set[str]:
+    """Packages that only extras install, by the names that are imported."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    return {re.split(r"[^A-Za-z0-9_-]", line)[0].replace("-", "_") for lines in extras.values() for line in lines} - {
+        "mbagent",
+        "pytest",
+    }
 
 
 def mean_return(agent: Any, env: gym.Env[Any, Any], episodes: int) -> float:
@@ -25,6 +37,17 @@ def mean_return(agent: Any, env: gym.Env[Any, Any], episodes: int) -> float:
             total += float(reward)
             done = terminated or truncated
     return total / episodes
+
+
+def test_what_the_readme_shows_first_needs_no_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for package in optional_packages():
+        monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    first, why, *_ = blocks(ROOT / "README.md")
+    exec(first.replace("50_000", "1_500"), names)
+    exec(why, names)
+    assert (tmp_path / "maneuverer.zip").exists()
 
 
 @pytest.mark.filterwarnings("ignore:.*History", "ignore:.*reward_fn")  # bins are not the whole state, and the agent says so

@@ -122,3 +122,19 @@ def test_mistakes_are_named() -> None:
         env.step(0)
     with pytest.raises(ValueError, match="options"):
         env.reset(options={"nonsense": 1})
+
+
+@pytest.mark.parametrize("agent", [None, "agent.zip"])
+def test_what_is_no_agent_is_refused(agent: Any) -> None:
+    with pytest.raises(TypeError, match="LearnedEnv needs an agent"):
+        LearnedEnv(agent)
+
+
+@pytest.mark.parametrize("action", [None, "x", 7, np.zeros((2, 3))])
+def test_a_wrong_action_is_called_an_action(action: Any) -> None:
+    env = LearnedEnv(learned(Corridor(limit=50)))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"^The action "):
+        env.step(action)
+    with pytest.raises(ValueError, match="takes one action, got a batch of 2"):
+        env.step(np.array([0, 1]))

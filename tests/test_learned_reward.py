@@ -60,6 +60,11 @@ def test_rewards_that_hang_on_something_else_are_reported() -> None:
     assert "hangs on what is not observed" in report.advice
 
 
+def test_both_zeros_are_one_reward() -> None:
+    report = LearnedReward((2,) * 4, 3).fit(replace(rows(500), rewards=np.where(np.arange(500) % 2, 0.0, -0.0)))
+    assert (report.n_values, report.contrary) == (1, 0.0)
+
+
 def test_one_reward_needs_no_learning() -> None:
     model = LearnedReward((2,) * 4, 3)
     report = model.fit(replace(rows(50), rewards=np.full(50, -1.0)))

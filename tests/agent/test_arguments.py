@@ -2,6 +2,7 @@
 
 import io
 import json
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -51,11 +52,49 @@ def test_steps_written_as_a_float_are_steps_and_zero_fits_what_was_met() -> None
         ({"model": 5}, TypeError, "model must be 'auto'"),
         ({"seed": -1}, ValueError, "seed must be a whole number from 0"),
         ({"seed": "x"}, ValueError, "seed must be a whole number from 0"),
+        ({"device": "tpu9"}, ValueError, "device must be 'auto', 'cpu' .* got 'tpu9'"),
+        ({"device": None}, ValueError, "device must be 'auto'"),
+        ({"policy_kwargs": 5}, TypeError, "policy_kwargs must be a dict"),
     ],
 )
 def test_settings_are_checked_when_the_agent_is_built(kwargs: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         ModelLearningAgent("MctsPolicy", gym.make(GEYSER), **kwargs)
+
+
+@pytest.mark.parametrize("policy", ["PpoPolicy", None, 5])
+def test_policies_are_listed_where_one_is_unknown(policy: Any) -> None:
+    with pytest.raises(ValueError, match=r"policy must be one of .*'FlatMonteCarloPolicy', 'MctsPolicy'.* got "):
+        ModelLearningAgent(policy, gym.make(GEYSER))
+
+
+@pytest.mark.parametrize("callback", [5, "x", [5], [None], [lambda local, world: True]])
+def test_what_is_no_callback_is_refused_before_a_step(runner: ModelLearningAgent, callback: Any) -> None:
+    with pytest.raises(TypeError, match="callback must be a BaseCallback"):
+        runner.learn(10, callback=callback)
+    assert runner.num_timesteps == 1500
+
+
+@pytest.mark.parametrize("package", ["rich", "tqdm"])
+def test_a_progress_bar_without_its_package_is_refused_before_a_step(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    agent = ModelLearningAgent("MctsPolicy", gym.make(GEYSER))
+    with pytest.raises(ImportError, match=rf'package {package}: pip install "mbagent\[progress\]"'):
+        agent.learn(10, progress_bar=True)
+    assert agent.num_timesteps == 0
+
+
+def test_no_steps_and_nothing_to_fit_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"learn\(0\) only fits the transitions collected so far, and there are none"):
+        ModelLearningAgent("MctsPolicy", gym.make(GEYSER)).learn(0)
+
+
+def test_what_reset_and_step_return_is_no_observation(runner: ModelLearningAgent) -> None:
+    env = gym.make(GEYSER)
+    with pytest.raises(ValueError, match=r"whole tuple that reset\(\) returned; pass its first element"):
+        runner.predict(env.reset())  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"whole tuple that step\(\) returned"):
+        runner.explain(env.step(0))
 
 
 def test_numbers_of_numpy_are_numbers() -> None:

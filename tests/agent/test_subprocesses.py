@@ -157,7 +157,8 @@ def test_a_process_that_ends_before_the_first_step_is_named(start: Start) -> Non
     env.close()
     with pytest.raises(RuntimeError, match="process of the SubprocVecEnv has ended"):
         agent.learn(10)
-    agent.learn(0)  # nothing to fit to, and nothing to complain of
+    with pytest.raises(ValueError, match="there are none"):
+        agent.learn(0)
     with pytest.raises(RuntimeError, match="process of the SubprocVecEnv has ended"):
         agent_in(env).learn(10)
 
