@@ -185,8 +185,10 @@ def _put(state: Ints, number: int, value: int, layout: Layout, ended: bool) -> b
 
 @compiled
 def event_draws(rate: float, n_grid: int) -> int:
-    """Of ``n_grid`` draws, those that go to the rare event: its share, but one at least where it can happen at all."""
-    return 0 if rate <= 0.0 else max(1, min(n_grid, math.ceil(rate * n_grid)))
+    """Of ``n_grid`` draws, those that go to the rare event: its share, but one at least for what can happen and what may not."""
+    if rate <= 0.0 or rate >= 1.0:
+        return 0 if rate <= 0.0 else n_grid
+    return max(1, min(n_grid - 1, math.ceil(rate * n_grid)))
 
 
 def mixed(parts: Sequence[tuple[NDArray[np.int64], NDArray[np.float64], Successors]], n_rows: int) -> Successors:
