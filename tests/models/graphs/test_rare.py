@@ -9,12 +9,14 @@ from tests.models.helpers import dataset
 
 RISK = 0.004
 
+Rows = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
-def machine(n: int, n_coins: int, seed: int, ends: bool = True, risk: float = RISK) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+
+def machine(n: int, n_coins: int, seed: int, ends: bool = True) -> Rows:
     """Gear 0 ... 2, whether it is broken, and coins that fall anew at every step; action 1 shifts up and may break it."""
     rng = np.random.default_rng(seed)
     gear, action = rng.integers(3, size=n), rng.integers(2, size=n)
-    broken = (action == 1) & (rng.random(n) < risk)
+    broken = (action == 1) & (rng.random(n) < RISK)
     before = np.column_stack([gear, np.zeros(n, dtype=np.int64), rng.integers(2, size=(n, n_coins))])
     after = np.column_stack([np.clip(gear + 2 * action - 1, 0, 2), broken, rng.integers(2, size=(n, n_coins))])
     return before, action, after, broken & ends
