@@ -91,7 +91,7 @@ class Explanation:
         rare: for each action the outcomes of less than ``RARE`` probability that take part in its value, those first that change
             it most (with flat Monte Carlo, which has no values of them, the least likely first). Probabilities are posterior
             means, of counts where the model is learned from counts.
-        effects: for each of these, by how much the action's value would differ if this outcome were as good as the others are on
+        effects: for each of these, what it adds to the action's value, compared with an outcome as good as the others are on
             average; 0 with flat Monte Carlo.
     """
 

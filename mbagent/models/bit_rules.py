@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mbagent.models.arithmetic import Floats, Ints
 from mbagent.models.causal_bits import settled_chance, write_outcomes
 from mbagent.models.compiled_model import Outcomes, implements, outcomes, work_for
-from mbagent.models.particles import MAIN, STRATA, Particles, begin, bit_chances, new_particles, share_out
+from mbagent.models.particles import MAIN, STRATA, Particles, begin, bit_chances, new_particles, place_of, share_out
 from mbagent.models.sparse_networks import Room, SparseNetworks, ask, leans_on_open, room_for, see_action, see_state
 from mbagent_envs._compiled import borrowed, compiled, inlined
 from mbagent_envs.random_keys import uniform_at
@@ -215,7 +215,7 @@ def rules_outcomes(k: BitRules, work: RulesWork, state: Ints, n_grid: int, key: 
     for action in range(k.n_actions):
         see_action(networks, room, state, action)
         n_open = 0
-        begin(p, n_grid, False)  # which bits are open is not known before
+        begin(p, n_grid, False, place_of(state))  # which bits are open is not known before
         for r in range(len(bits)):
             i, start, end, chance = bits[r, 0], bits[r, 4], bits[r, 5], 0.5
             place, weight = _by_state(r, action, state, bits, parents)

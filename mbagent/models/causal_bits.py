@@ -24,6 +24,7 @@ from mbagent.models.particles import (
     bit_chances,
     n_outcomes,
     new_particles,
+    place_of,
     share_out,
     slot_of,
     weigh,
@@ -165,7 +166,7 @@ def bits_outcomes(k: CausalBits, work: BitsWork, state: Ints, n_grid: int, key: 
     for action in range(n_actions):
         predict(action, n_bits, on[:n_on], sums, first, last, last_bias, stay, k.activation, hidden, logits)
         n_open, n_shown = _settle(logits, group_of, certain, base, still_open, shown)
-        begin(p, n_grid, n_open < 62 and 1 << n_open <= n_grid)
+        begin(p, n_grid, n_open < 62 and 1 << n_open <= n_grid, place_of(state))
         for w in range(n_open):
             i = still_open[w]
             g, logit = group_of[i], float(logits[i])

@@ -51,13 +51,13 @@ def work_for(kernel: Any, n_grid: int) -> Any:
 
 
 def outcomes(kernel: Any, work: Any, state: Any, n_grid: int, key: Any, offset: float, out: Outcomes) -> int:
-    """Writes what may follow a state to ``out``: systematic draws, as ``TransitionModel.successors``.
+    """Writes what may follow a state to ``out``: listed or stratified, as ``TransitionModel.successors``.
 
     Args:
         kernel: the model's arrays.
         work: see ``work_for``.
         state: int64 [F].
-        n_grid: draws for each action, at most.
+        n_grid: draws for each action, beside strata for what is rare.
         key: of the draws, as ``particles.start`` makes it of a seed.
         offset: likewise.
         out: with room for twice ``n_grid`` outcomes of each action, and four at least.

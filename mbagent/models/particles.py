@@ -4,7 +4,7 @@ Variables are taken one after the other; each particle stands for what those so 
 listed with their exact probabilities. Elsewhere particles are stratified. The *main* particles are runs of grid points, of which
 each value of a variable gets its share. A value too rare for the grid gets a particle of its own, a *stratum*: all outcomes in
 which this is the first rare value. It carries the stratum's exact probability, and draws what later variables become. So every
-possible value of every variable takes part, the weights add up to one, and expected values are unbiased (stratified sampling,
+rare value of every variable takes part, the weights add up to one, and expected values are unbiased (stratified sampling,
 Cochran 1977). Where there are more strata than room, two are merged: one of them is kept, with a chance in proportion to its
 weight, and gets the weight of both. Whether the episode ends is never merged with anything else.
 Shapes: n grid points, 2 n slots (main particles first, strata from slot n on), O open variables, K values.
@@ -26,17 +26,18 @@ from mbagent_envs._compiled import compiled, inlined
 from mbagent_envs.random_keys import derive, derive_one, uniform_at, uniforms
 
 NEGLIGIBLE = 0.01
-"""Probabilities under this share of the variable's largest are noise of the fit where no observation stands behind them;
-planners would exploit them, so they count as 0."""
+"""Probabilities under this share of the variable's largest are taken for noise of the fit, which planners would exploit: they
+count as 0. Decision graphs do so only where no observation stands behind them; networks cannot tell, and do so always."""
 
-RARE = 0.05
-"""The least likely values of a variable, of less than this probability together, get strata of their own."""
+RARE, TOGETHER = 0.05, 0.25
+"""Values of less than the first probability get strata of their own, those that together have less than the second."""
 
 CHUNK = 2048
 """Rows worked on at once; bounds the memory."""
 
-MAIN, STRATA, EXACT, MERGES = range(4)
-"""Entries of ``Particles.state``: numbers of main particles and of strata, whether all outcomes are listed, merges so far."""
+MAIN, STRATA, EXACT, MERGES, PLACE = range(5)
+"""Entries of ``Particles.state``: numbers of main particles and of strata, whether all outcomes are listed, merges so far, and a
+number of the state, on which it depends which strata are merged: else the same would be missing everywhere."""
 
 _TAG = 1 << 32
 """Variable number ``i`` with value ``k`` is stratum ``i * _TAG + k``; of whether the episode ends, ``-1 - k``."""
@@ -56,7 +57,7 @@ FIRST, POINTS, TAG = range(3)
 
 LOW, HIGH, MASS, SHARE = range(4)
 """Columns of ``Particles.chances``: ends of the interval of [0, 1) that the points lie in; exact probability of the outcome so
-far, of a stratum all of its weight; probability that no value so far was rare."""
+far, of a stratum all of its weight; probability that no value so far was rare, of a stratum its own probability."""
 
 
 class Particles(NamedTuple):
@@ -67,7 +68,7 @@ class Particles(NamedTuple):
         chances: see LOW, [2 n, 4].
         factors: values of the row's open variables so far, int64 [2 n, O], in order.
         rare: probabilities of the values of a variable that are set apart, [K].
-        state: see MAIN, int64 [4].
+        state: see MAIN, int64 [5].
         left: probability of the strata that found no room, [1].
     """
 
@@ -94,14 +95,14 @@ def new_particles(n_grid: int, n_outputs: int, n_values: int) -> Particles:
         np.empty((2 * n_grid, 4), dtype=np.float64),
         np.empty((2 * n_grid, n_outputs), dtype=np.int64),
         np.empty(n_values, dtype=np.float64),
-        np.zeros(4, dtype=np.int64),
+        np.zeros(5, dtype=np.int64),
         np.zeros(1, dtype=np.float64),
     )
 
 
 @inlined
-def begin(p: Particles, n_grid: int, exact: bool) -> None:
-    """One particle with all points. ``exact``: there is room to list all outcomes, at most 2 n."""
+def begin(p: Particles, n_grid: int, exact: bool, place: int) -> None:
+    """One particle with all points. ``exact``: there is room to list all outcomes, at most 2 n. ``place``: see PLACE."""
     p.grid[0, FIRST], p.grid[0, POINTS], p.chances[0, LOW], p.chances[0, HIGH], p.chances[0, MASS], p.chances[0, SHARE] = (
         0,
         n_grid,
@@ -111,7 +112,16 @@ def begin(p: Particles, n_grid: int, exact: bool) -> None:
         1.0,
     )
     p.state[MAIN], p.state[STRATA], p.state[EXACT], p.state[MERGES] = 1, 0, int(exact), 0
-    p.left[0] = 0.0
+    p.state[PLACE], p.left[0] = place, 0.0
+
+
+@compiled
+def place_of(state: Ints) -> int:
+    """A number of a state [F], see PLACE."""
+    total = np.uint64(0)
+    for f in range(len(state)):
+        total = total * np.uint64(31) + np.uint64(state[f] + 1)
+    return int(total >> np.uint64(2))
 
 
 @inlined
@@ -175,17 +185,17 @@ def n_possible(values: Floats, start: int, n: int) -> int:
 def _set_apart(values: Floats, rare: Floats, n: int) -> float:
     """Moves the rare values [n] to ``rare`` [n], scales the others to sum to one; returns the probability of all rare ones.
 
-    Rare are those that are less probable than some bound and together have less than RARE; of equally probable ones all or none.
+    Rare are those that are less probable than some bound, at most RARE, and together have less than TOGETHER; of equally
+    probable ones all or none.
     """
-    bound, total = RARE, RARE
-    while total >= RARE:
+    bound, total = RARE, TOGETHER
+    while total >= TOGETHER:
         total = 0.0
         for k in range(n):
             if values[k] < bound:
                 total += values[k]
-        if total < RARE:
-            break
-        bound *= 0.5
+        if total >= TOGETHER:
+            bound *= 0.5
     for k in range(n):
         rare[k] = 0.0
         if total > 0.0:
@@ -324,12 +334,17 @@ def _add_stratum(p: Particles, q: int, unit: int, k: int, w: int, weight: float,
     before, total = chances[slot, MASS], chances[slot, MASS] + weight
     if before > 0.0:
         state[MERGES] += 1
-        kept = uniform_at(derive_one(key, _MERGE), state[MERGES]) * total >= weight
+        kept = uniform_at(derive_one(key, _MERGE + np.uint64(state[PLACE])), state[MERGES]) * total >= weight
         if points[slot, TAG] != tag:
-            p.left[0] += weight if kept else before
+            p.left[0] += weight if kept else chances[slot, SHARE]
+            chances[slot, SHARE] = chances[slot, SHARE] if kept else weight
+        else:
+            chances[slot, SHARE] += weight
         if kept:
             chances[slot, MASS] = total
             return
+    else:
+        chances[slot, SHARE] = weight
     for v in range(w):
         factors[slot, v] = factors[q, v]
     factors[slot, w], chances[slot, MASS], points[slot, TAG] = k, total, tag
@@ -339,15 +354,18 @@ def _add_stratum(p: Particles, q: int, unit: int, k: int, w: int, weight: float,
 def weigh(p: Particles, n_grid: int) -> None:
     """Turns the particles' masses into their probabilities, summing to one.
 
-    Where every outcome was found they are exact, else main particles have what their grid points stand for.
+    Where all outcomes are listed they are exact. Else a main particle that was sure to be found keeps its own, and a less
+    probable one has that of a grid point: what it was found with (Hájek 1971: mass by the chance of being found, scaled).
     """
-    points, chances, state = p.grid, p.chances, p.state
-    found, total = 0.0, 0.0
-    for i in range(n_outcomes(p)):
-        found += chances[slot_of(p, i, n_grid), MASS]
-    if found < 1.0 - 1e-9:
-        for q in range(state[MAIN]):
-            chances[q, MASS] = points[q, POINTS] / n_grid * chances[q, SHARE]
+    points, chances, n_main, total = p.grid, p.chances, p.state[MAIN], 0.0
+    if not p.state[EXACT]:
+        wanted, weights = 0.0, 0.0
+        for q in range(n_main):
+            wanted += points[q, POINTS] / n_grid * chances[q, SHARE]
+            chances[q, MASS] = max(chances[q, MASS], chances[q, SHARE] / n_grid)
+            weights += chances[q, MASS]
+        for q in range(n_main):
+            chances[q, MASS] *= wanted / weights
     for i in range(n_outcomes(p)):
         total += chances[slot_of(p, i, n_grid), MASS]
     for i in range(n_outcomes(p)):

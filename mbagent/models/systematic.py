@@ -30,6 +30,7 @@ from mbagent.models.particles import (
     assemble,
     begin,
     new_particles,
+    place_of,
     prune,
     room,
     rows_at_once,
@@ -52,7 +53,7 @@ def _independent(probs: Floats, outputs: Ints, grid: Grid) -> Found:
     for b in range(n_rows):
         n_open = 0
         settle(probs, b, outputs, base)
-        begin(p, n_grid, _fits(probs, b, outputs, base, n_grid))
+        begin(p, n_grid, _fits(probs, b, outputs, base, n_grid), 0)  # no state is known
         for i in range(n_outputs):
             if base[i] >= 0:
                 continue
@@ -108,7 +109,7 @@ def _causal(
             if not (group.group_of[i] < 0 or trusted(probs, b, i, layout, group, certain)):
                 base[i] = -1
             possible = min(possible * (layout.outputs[i] if base[i] < 0 else 1), n_grid + 1)
-        begin(p, n_grid, possible <= n_grid)
+        begin(p, n_grid, possible <= n_grid, place_of(states[b]))
         for i in range(n_outputs):
             n, trust = layout.outputs[i], group.group_of[i] < 0 or trusted(probs, b, i, layout, group, certain)
             if base[i] >= 0:

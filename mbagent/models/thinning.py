@@ -14,6 +14,7 @@ from mbagent.models.particles import (
     begin,
     bit_chances,
     n_outcomes,
+    n_possible,
     new_particles,
     share_out,
     slot_of,
@@ -26,7 +27,7 @@ from mbagent_envs._compiled import compiled
 def thin(full: Successors, n_samples: int, seed: int) -> Successors:
     """Cuts rows with more than ``n_samples`` successors down to at most twice as many.
 
-    What is rare, and that the episode ends, always stays; see ``particles.py``.
+    What is rare stays as long as there is room, and that the episode ends always does; see ``particles.py``.
 
     Args:
         full: all successors, with exact probabilities.
@@ -59,10 +60,14 @@ def _thinned(offsets: Ints, terminated: Bools, probabilities: Floats, grid: Grid
                 chosen[total + k], weights[total + k] = first + k, probabilities[first + k]
             total += n
             continue
-        ending = (probabilities[first : first + n] * terminated[first : first + n]).sum()
-        begin(p, n_grid, False)
-        p.factors[0, 0] = int(ending > 0.0)
-        if 0.0 < ending < 1.0:
+        ends, ending = 0, 0.0
+        for k in range(first, first + n):
+            if terminated[k] and probabilities[k] > 0.0:
+                ends, ending = ends + 1, ending + probabilities[k]
+        others = n_possible(probabilities, first, n) - ends
+        begin(p, n_grid, False, 0)
+        p.factors[0, 0] = int(ends > 0)
+        if ends > 0 and others > 0:
             bit_chances(ending, values)
             share_out(p, -1, 0, 0, values, 2, True, grid)
         n_main, n_strata = p.state[MAIN], p.state[STRATA]

@@ -217,10 +217,15 @@ def _lead_to_news(graph: GraphArrays, q: Floats, tie: float, gamma: float, max_s
             break
 
 
+SLIGHT = 1e-3
+"""Share of the range of values that it is not worth a warning to be off by."""
+
+
 def doubt(graph: StateGraph, values: Values, gamma: float) -> Floats | None:
     """How far each action's value [N, A] may be off since other rare outcomes stand for some; None where all take part.
 
-    On each step that is at most their probability times the range of all values found; later steps follow the best behaviour.
+    On each step that is taken to be their probability times the range of all values found, as if those left out were as extreme
+    as the others are; later steps follow the best behaviour. None, too, where all of it is less than ``SLIGHT`` of that range.
     """
     if not graph.left_out.any():
         return None
@@ -232,7 +237,7 @@ def doubt(graph: StateGraph, values: Values, gamma: float) -> Floats | None:
             span[group] = np.ptp(values.rewards[edges] + after)
     bounds = graph.left_out * span[graph.groups][:, None]
     _add_later_doubt(graph.arrays, values.q, gamma, bounds.copy(), bounds)
-    return bounds
+    return bounds if bounds.max() > SLIGHT * span.max() else None
 
 
 @compiled

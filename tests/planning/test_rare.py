@@ -119,7 +119,7 @@ def blinking(n_bits: int) -> DecisionGraphModel:
 
 @pytest.mark.parametrize("n_bits", [3, 25])
 def test_plans_say_where_rare_outcomes_that_may_decide_have_no_room(n_bits: int) -> None:
-    settings = PlannerSettings(n_samples=4, max_states=50, num_simulations=16, learn_values=False)
+    settings = PlannerSettings(n_samples=4, max_states=1, num_simulations=16, learn_values=False)
     planner, start = MctsPlanner(settings), np.zeros((1, n_bits), dtype=np.int64)
     planner.set_model(blinking(n_bits), start)
     planner.set_goal(lambda states, actions, after: 0.01 * after[:, -1] + after[:, :-1].sum(axis=1))

@@ -232,7 +232,7 @@ def show_next_meetings(following: Ints, layout: Layout, on: Bools) -> None:
 
 @inlined
 def without_noise(rate: float, spread: float, n: int, noise: float) -> float:
-    """A leaf's rate for planning, of one of ``n`` values; negative where no observation stands behind it.
+    """A leaf's rate for planning, of one of ``n`` values; negative where it counts only if it is not negligible.
 
     Leaves whose rows all agree, as ``spread`` tells, are sure. Bits are decided at once, other values once all are known.
     """
@@ -264,10 +264,10 @@ def with_rest(
 
     The graphs give the rates of all values but the present one, which has the rest. Where the unit was never seen to stay, the
     rest is taken for an error of estimation unless it is larger than such an error can be; for planning, also where graphs ask
-    for anything (``asked``), so that rows in which it stayed may have been others.
+    for anything (``asked``), so that rows in which it stayed may have been others, and it is much less than in all rows.
     """
     stay = 1.0 - total
-    observed = not known or (stays > 0.0 and (stay > slack or not asked))
+    observed = not known or (stays > 0.0 and (stay > slack or not asked or stay >= 0.5 * stays))
     if known:
         stay = max(0.0, stay - slack) if stays == 0.0 else max(stay, min(slack, stays))
     out[start + value] = stay if observed or noise == 0.0 else -stay

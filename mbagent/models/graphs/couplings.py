@@ -41,6 +41,18 @@ def couple(coupling: int, state: Ints, rates: Floats, still: Bools, layout: Layo
 
 
 @compiled
+def n_choices(coupling: int, state: Ints, rates: Floats, still: Bools, layout: Layout, graphs: Graphs) -> int:
+    """How many bits of a coupling may be on, and one more for none, unless a bit is sure to be on; at least 1."""
+    possible, sure = 0, False
+    for k in range(layout.coupled_first[coupling], layout.coupled_first[coupling + 1]):
+        unit = layout.coupled[k]
+        rate = float(state[layout.members[layout.first[unit]]]) if still[unit] else rates[graphs.start[unit] + 1]
+        possible += int(rate > 0.0)
+        sure |= rate >= 1.0
+    return possible + int(not sure)
+
+
+@compiled
 def leave_out_none(chances: Floats, n: int) -> None:
     """Takes "none", the last of ``n`` chances, for an error of the bits' rates where it is negligible beside the likeliest."""
     none, top = chances[n - 1], chances[:n].max()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, meets
+from mbagent.models.graphs.compiled import Bools, Floats, Graphs, Ints, meets, without_noise
 from mbagent.models.graphs.units import Layout
 from mbagent.models.particles import NEGLIGIBLE
 from mbagent_envs._compiled import inlined
@@ -32,9 +32,8 @@ def end_graph(layout: Layout, late: Graphs) -> tuple[Ints, NDArray[np.int32], Fl
         pair = late.pairs[len(layout.outputs) - 2] + 2 * way
         if late.entries[pair + 1] > late.entries[pair]:
             first[way] = late.nodes[late.entries[pair]]
-    sure, rate = late.spread == 0.0, late.rate
-    rate = np.where(sure & (rate < NEGLIGIBLE), 0.0, np.where(sure & (rate > 1.0 - NEGLIGIBLE), 1.0, rate))
-    return first, np.stack([late.column, late.off, late.on], axis=1).astype(np.int32), rate
+    rates = [without_noise(rate, spread, 2, NEGLIGIBLE) for rate, spread in zip(late.rate, late.spread, strict=True)]
+    return first, np.stack([late.column, late.off, late.on], axis=1).astype(np.int32), np.asarray(rates, dtype=np.float64)
 
 
 @inlined

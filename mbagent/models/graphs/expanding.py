@@ -39,11 +39,15 @@ from mbagent.models.particles import (
     n_outcomes,
     n_possible,
     new_particles,
+    place_of,
     share_out,
     slot_of,
     weigh,
 )
 from mbagent_envs._compiled import compiled, inlined
+
+_SURE = 1 << 40
+"""Counted for a bit that is sure to be on."""
 
 
 class GraphWork(NamedTuple):
@@ -121,6 +125,7 @@ def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.u
     p, acts = work.p, g.acts
     counts, met, weights, late_end = g.counts, g.met, g.weights, len(g.end_first) > 0
     n_actions, first_meeting = len(always), len(columns) + acts.n_columns
+    place = place_of(state)
     n_different = show_state(state, shown, columns, different, on)
     for m in range(len(meetings)):
         on[first_meeting + m] = meets(state, cells, meetings[m])
@@ -135,7 +140,7 @@ def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.u
         )
         for f in range(len(state)):
             base[f] = state[f]
-        begin(p, n_grid, _fits(listed[:n], units, rates, per_coupling, late_end, n_grid))
+        begin(p, n_grid, _fits(listed[:n], units, rates, per_coupling, late_end, n_grid), place)
         n_open, ended = _settle(
             listed[:n], units, members, exactly, values, rates, joint, coupled, per_coupling, opened, p, base, late_end, grid
         )
@@ -193,13 +198,15 @@ def _fits(touched: Ints, units: Ints, rates: Floats, per_coupling: Ints, ends_la
     for unit in touched:
         coupling = units[unit, COUPLING]
         if coupling >= 0:
-            per_coupling[coupling] += int(rates[units[unit, START] + 1] > 0.0)
+            rate = rates[units[unit, START] + 1]  # as ``couplings.n_choices``
+            per_coupling[coupling] += int(rate > 0.0) + (_SURE if rate >= 1.0 else 0)
         elif not (ends_late and unit == len(units) - 2):
             possible = min(possible * n_possible(rates, units[unit, START], units[unit, OUTPUTS]), n_grid + 1)
     for unit in touched:
         coupling = units[unit, COUPLING]
         if coupling >= 0 and per_coupling[coupling] > 0:
-            possible = min(possible * (per_coupling[coupling] + 1), n_grid + 1)  # one more: none
+            choices = per_coupling[coupling] % _SURE + int(per_coupling[coupling] < _SURE)
+            possible = min(possible * choices, n_grid + 1)
             per_coupling[coupling] = 0
     return possible <= n_grid
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.base import Successors
+from mbagent.models.particles import RARE
 from mbagent.spaces import PlaneLayout
 from mbagent.transitions import TransitionBatch
 from mbagent_envs._compiled import compiled
@@ -164,7 +165,7 @@ def leave_out(
 ) -> int:
     """Takes those of the outcomes ``first`` to ``first + n`` that go on and break a law out, in place; returns how many are left.
 
-    The others that go on share their probability. Where none of them keeps the laws, all stay.
+    The others that go on share their probability. Where hardly any of that keeps the laws, all stay.
     """
     kept, lost = 0.0, 0.0
     for q in range(first, first + n):
@@ -173,7 +174,7 @@ def leave_out(
                 kept += probabilities[q]
             else:
                 lost += probabilities[q]
-    if lost == 0.0 or kept == 0.0:
+    if lost == 0.0 or kept < RARE * (kept + lost):
         return n
     left = first
     for q in range(first, first + n):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mbagent.models.base import Successors
 from mbagent.models.graphs.compiled import Graphs, Ints, distributions, show, show_next, show_next_meetings, write
-from mbagent.models.graphs.couplings import couple, leave_out_none, settle
+from mbagent.models.graphs.couplings import couple, leave_out_none, n_choices, settle
 from mbagent.models.graphs.draws import Work, alone, is_late, only_possible, work_space
 from mbagent.models.graphs.units import Layout
 from mbagent.models.particles import (
@@ -27,6 +27,7 @@ from mbagent.models.particles import (
     n_outcomes,
     n_possible,
     new_particles,
+    place_of,
     room,
     share_out,
     slot_of,
@@ -51,7 +52,7 @@ def successors(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, late
         distributions(graphs.changing, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
         base[:] = states[b]
         n_open, ended = 0, False
-        begin(p, n_grid, _fits(early, states[b], layout, graphs, late, w, n_grid))
+        begin(p, n_grid, _fits(early, states[b], layout, graphs, late, w, n_grid), place_of(states[b]))
         for number in early:
             n, value = _distribution(number, states[b], layout, graphs, w)
             best = only_possible(w.joint, 0, n)
@@ -74,12 +75,16 @@ def _fits(early: Ints, state: Ints, layout: Layout, graphs: Graphs, late: Graphs
     """Whether all outcomes of a row can be listed."""
     possible = 1
     for number in early:
-        n, _ = _distribution(number, state, layout, graphs, w)
-        possible *= n_possible(w.joint, 0, n)
+        if number >= len(layout.outputs):
+            possible *= n_choices(number - len(layout.outputs), state, w.rates, w.still, layout, graphs)
+        else:
+            possible *= n_possible(w.rates, graphs.start[number], layout.outputs[number])
         if possible > n_grid:
             return False
     for unit in late.changing:
-        possible *= layout.outputs[unit]
+        late_here = is_late(unit, w.rates, layout, graphs)
+        possible *= layout.outputs[unit] if late_here else n_possible(w.rates, graphs.start[unit], layout.outputs[unit])
+        possible = min(possible, 2 * n_grid + 1)
     return bool(possible <= 2 * n_grid)
 
 
@@ -185,10 +190,10 @@ def _put(state: Ints, number: int, value: int, layout: Layout, ended: bool) -> b
 
 @compiled
 def event_draws(rate: float, n_grid: int) -> int:
-    """Of ``n_grid`` draws, those that go to the rare event: its share, but one at least for what can happen and what may not."""
+    """Of ``n_grid`` draws, those that go to the rare event: its share, or a quarter; one at least for each of what can happen."""
     if rate <= 0.0 or rate >= 1.0:
         return 0 if rate <= 0.0 else n_grid
-    return max(1, min(n_grid - 1, math.ceil(rate * n_grid)))
+    return max(1, min(n_grid - 1, max(n_grid // 4, math.ceil(rate * n_grid))))
 
 
 def mixed(parts: Sequence[tuple[NDArray[np.int64], NDArray[np.float64], Successors]], n_rows: int) -> Successors:
