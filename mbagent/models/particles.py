@@ -32,6 +32,9 @@ count as 0. Decision graphs do so only where no observation stands behind them; 
 RARE, TOGETHER = 0.05, 0.25
 """Values of less than the first probability get strata of their own, those that together have less than the second."""
 
+ENOUGH = 4.0
+"""Values that so many grid points are expected for are not rare: points tell more of what comes with them than a stratum does."""
+
 CHUNK = 2048
 """Rows worked on at once; bounds the memory."""
 
@@ -182,13 +185,13 @@ def n_possible(values: Floats, start: int, n: int) -> int:
 
 
 @compiled
-def _set_apart(values: Floats, rare: Floats, n: int) -> float:
+def _set_apart(values: Floats, rare: Floats, n: int, n_grid: int) -> float:
     """Moves the rare values [n] to ``rare`` [n], scales the others to sum to one; returns the probability of all rare ones.
 
-    Rare are those that are less probable than some bound, at most RARE, and together have less than TOGETHER; of equally
-    probable ones all or none.
+    Rare are those that are less probable than some bound, at most RARE or what ENOUGH says, and together have less than TOGETHER;
+    of equally probable ones all or none.
     """
-    bound, total = RARE, TOGETHER
+    bound, total = min(RARE, ENOUGH / n_grid), TOGETHER
     while total >= TOGETHER:
         total = 0.0
         for k in range(n):
@@ -231,7 +234,7 @@ def share_out(p: Particles, only: int, unit: int, w: int, values: Floats, n: int
             factors[slot, w] = draw(values, n, uniform_at(derive_one(grid[1], _LATER + np.uint64(slot)), unit))
     if only >= n_grid:
         return
-    rare = _set_apart(values, apart, n)
+    rare = _set_apart(values, apart, n, n_grid)
     for i in range(n_main if only < 0 else 1):
         q = max(i, only)
         here = points[q, POINTS] / n_grid * chances[q, SHARE]
