@@ -71,7 +71,7 @@ def test_compiled_expansion_is_that_of_the_successors(changes: dict[str, object]
         several += int(compiled.counts[: len(states)].max() > 1)
         for node in range(len(states)):
             assert_same(compiled, plain, node, node)
-    assert several == 2  # with more draws than one there is more than one outcome
+    assert several == 3  # with one draw, too: what is rare comes beside it
 
 
 def test_what_follows_a_state_does_not_depend_on_the_others() -> None:
