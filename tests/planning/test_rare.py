@@ -73,6 +73,35 @@ def test_a_loss_far_below_one_percent_decides_where_it_should(policy: str, p: fl
     assert "rare" in why.table()
 
 
+class LeakyTank(Dam):
+    """The same on two planes: a mark that goes round in the first; a burst is a cell of the second, and the end."""
+
+    def __init__(self, p: float, loss: float) -> None:
+        super().__init__(p, loss)
+        self.observation_space = spaces.MultiBinary((2, 5, 5))
+
+    def _seen(self, full: int, burst: int) -> Any:
+        planes = np.zeros((2, 5, 5), dtype=np.int8)
+        planes[0, self.t % 5, 0], planes[1, 2, 3] = 1, burst
+        return planes
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self.t = 0
+        return super().reset(seed=seed)
+
+
+@pytest.mark.parametrize("loss", [900.0, 30.0])
+def test_on_planes_a_rare_end_comes_with_the_cell_that_shows_it(loss: float) -> None:
+    agent = learned(LeakyTank(0.004, loss), "MctsPolicy", 12_000)
+    rows = agent.transitions.rows()
+    low, full = values_of(float(rows.terminated[rows.actions == 1].mean()), loss)
+    why = agent.explain(agent.get_env().reset()[0])
+    assert why.values == pytest.approx([low, full], rel=0.05)
+    (burst,) = why.rare[1]
+    assert burst.terminated
+    assert burst.observation[1, 2, 3] == 1
+
+
 def test_a_rare_loss_among_flickering_lamps_is_seen_by_search() -> None:
     def reward(obs: Any, action: Any, after: Any) -> Any:
         return 2.0 + action - 2000.0 * after[:, 1]

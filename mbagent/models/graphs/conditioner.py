@@ -12,6 +12,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammainc, ndtr
 
 from mbagent.models.graphs import draws
 from mbagent.models.graphs.compiled import Graphs
@@ -22,8 +23,11 @@ Ints: TypeAlias = NDArray[np.int64]
 Bools: TypeAlias = NDArray[np.bool_]
 Floats: TypeAlias = NDArray[np.float64]
 
-UNCERTAIN = 8.0
-"""Variance summed over all rows from which a column counts as uncertain, and two as comparable."""
+UNCERTAIN = 2.0
+"""Variance summed over all rows from which a column counts as uncertain."""
+
+MANY = 8.0
+"""Products of two columns' variances summed over all rows from which the sum of their errors' products is about normal."""
 
 APART = 6.0
 """Standard errors that two columns' errors must go together by, beyond what the largest of so many reaches by chance."""
@@ -68,12 +72,37 @@ def probabilities(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Floa
 
 def go_together(error: Floats, other: Floats, spread: Floats, other_spread: Floats, n_tried: int) -> bool:
     """Whether two columns' errors [...] go together, given their variances [...], one of ``n_tried`` such questions."""
-    return bool(_telling(np.asarray((error * other).sum()), np.asarray((spread * other_spread).sum()), n_tried))
+    size = error.size
+    pair = (part.reshape(size, 1) for part in (error, other, spread, other_spread))
+    return bool(_telling(*pair, n_tried)[0, 0])
 
 
-def _telling(products: Floats, variances: Floats, n_tried: int) -> Bools:
+def _telling(error: Floats, other: Floats, spread: Floats, other_spread: Floats, n_tried: int) -> Bools:
+    """Which columns' errors go together, bool [D, E], from errors and variances [N, D] and [N, E].
+
+    Of many by the sum of products of errors; of rare values by how often both came unexpectedly in the same row, which by
+    chance has a Poisson distribution.
+    """
     limit = APART + np.sqrt(2.0 * np.log(max(n_tried, 2)))
-    result: Bools = (variances > UNCERTAIN) & (np.abs(products) > limit * np.sqrt(variances))
+    products, variances = error.T @ other, spread.T @ other_spread
+    result: Bools = (variances > MANY) & (np.abs(products) > limit * np.sqrt(variances))
+    few = variances <= MANY
+    if few.any():
+        both = _unexpected(error).T @ _unexpected(other)
+        expected = _least(spread).T @ _least(other_spread)
+        result |= few & (both > 0.0) & (gammainc(np.maximum(both, 1.0), expected) < ndtr(-limit))  # P(Poisson >= both)
+    return result
+
+
+def _unexpected(error: Floats) -> Floats:
+    """1 where what came was the less probable, else 0."""
+    result: Floats = (np.abs(error) > 0.5).astype(np.float64)
+    return result
+
+
+def _least(spread: Floats) -> Floats:
+    """Probability of the less probable of two values, of the variance."""
+    result: Floats = 0.5 - np.sqrt(np.maximum(0.25 - spread, 0.0))
     return result
 
 
@@ -109,7 +138,7 @@ def _dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, owner: Int
     telling = np.zeros((len(uncertain), len(uncertain)), dtype=np.bool_)
     for action in np.unique(rows.actions):  # what goes together under one action may go apart under another
         e, v = error[rows.actions == action], spread[rows.actions == action][:, uncertain]
-        telling |= _telling(e.T @ e, v.T @ v, len(uncertain))
+        telling |= _telling(e, e, v, v, len(uncertain))
     unit, coupling = owner[uncertain], layout.coupling_of[owner[uncertain]]
     earlier = unit[:, None] < unit
     together = (coupling[:, None] == coupling) & (coupling >= 0)

@@ -142,7 +142,7 @@ def sample(
             show_next(following[b], layout, w.on)
         for i in range(len(late.changing)):
             unit = late.changing[i]
-            if is_late(unit, w.rates, layout, graphs):
+            if is_late(unit, actions[b], w, layout, graphs):
                 if unit == n_units - 2:
                     show_next_meetings(following[b], layout, w.on)
                 distributions(late.changing[i : i + 1], states[b], actions[b], layout, late, w.on, w.values, w.rates)
@@ -152,9 +152,27 @@ def sample(
 
 
 @compiled
-def is_late(unit: int, rates: Floats, layout: Layout, graphs: Graphs) -> bool:
-    """Whether a unit that has late graphs needs them here, by its rates without."""
-    return unit == len(layout.outputs) - 2 or settled(rates, graphs.start[unit], layout.outputs[unit]) < 0
+def is_late(unit: int, action: int, w: Work, layout: Layout, graphs: Graphs) -> bool:
+    """Whether a unit that has late graphs needs them here: of what may follow, more than one value was observed, or is likely.
+
+    Args:
+        unit: its number.
+        action: the action.
+        w: columns, present values and rates, as ``distributions`` left them.
+        layout: the units.
+        graphs: of each unit for itself.
+    """
+    n = layout.outputs[unit]
+    if unit == len(layout.outputs) - 2 or settled(w.rates, graphs.start[unit], n) < 0:
+        return True
+    pair = graphs.pairs[unit] + layout.acts.way[action] * n + w.values[unit]
+    for entry in range(graphs.entries[pair], graphs.entries[pair + 1]):
+        node = graphs.nodes[entry]
+        while graphs.column[node] >= 0:
+            node = graphs.on[node] if w.on[graphs.column[node]] else graphs.off[node]
+        if graphs.spread[node] > 0.0:
+            return True
+    return False
 
 
 @compiled
@@ -191,7 +209,7 @@ def log_prob(
             show_next(following[b], layout, w.on)
             show_next_meetings(following[b], layout, w.on)
         for i in range(len(late.changing)):
-            if is_late(late.changing[i], w.rates, layout, graphs):
+            if is_late(late.changing[i], actions[b], w, layout, graphs):
                 distributions(late.changing[i : i + 1], states[b], actions[b], layout, late, w.on, w.values, w.rates)
         other[:] = states[b]
         for unit in everything:
@@ -272,5 +290,5 @@ def uncertain(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, units
         show(states[b], actions[b], layout, w.on)
         distributions(units, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
         for i in range(len(units)):
-            result[b, i] = is_late(units[i], w.rates, layout, graphs)
+            result[b, i] = is_late(units[i], actions[b], w, layout, graphs)
     return result

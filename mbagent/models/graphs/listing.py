@@ -52,7 +52,7 @@ def successors(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, late
         distributions(graphs.changing, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
         base[:] = states[b]
         n_open, ended = 0, False
-        begin(p, n_grid, _fits(early, states[b], layout, graphs, late, w, n_grid), place_of(states[b]))
+        begin(p, n_grid, _fits(early, states[b], actions[b], layout, graphs, late, w, n_grid), place_of(states[b]))
         for number in early:
             n, value = _distribution(number, states[b], layout, graphs, w)
             best = only_possible(w.joint, 0, n)
@@ -71,7 +71,7 @@ def successors(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, late
 
 
 @compiled
-def _fits(early: Ints, state: Ints, layout: Layout, graphs: Graphs, late: Graphs, w: Work, n_grid: int) -> bool:
+def _fits(early: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs, late: Graphs, w: Work, n_grid: int) -> bool:
     """Whether all outcomes of a row can be listed."""
     possible = 1
     for number in early:
@@ -82,7 +82,7 @@ def _fits(early: Ints, state: Ints, layout: Layout, graphs: Graphs, late: Graphs
         if possible > n_grid:
             return False
     for unit in late.changing:
-        late_here = is_late(unit, w.rates, layout, graphs)
+        late_here = is_late(unit, action, w, layout, graphs)
         possible *= layout.outputs[unit] if late_here else n_possible(w.rates, graphs.start[unit], layout.outputs[unit])
         possible = min(possible, 2 * n_grid + 1)
     return bool(possible <= 2 * n_grid)
@@ -122,7 +122,7 @@ def _split_late(
         number = late.changing[i]
         n, start = layout.outputs[number], late.start[number]
         still_open[n_open] = number
-        if not is_late(number, w.rates, layout, graphs):
+        if not is_late(number, action, w, layout, graphs):
             w.joint[:n] = w.rates[start : start + n]
             share_out(p, -1, number, n_open, w.joint, n, number == end, grid)
             n_open += 1

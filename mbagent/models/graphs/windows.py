@@ -28,7 +28,8 @@ CELL, BORDER, ACTION, MEETING, NEXT, WRAP, NEXT_MEETING = 0, 1, 2, 3, 4, 5, 6
 - CELL: channel, value, rows below, columns to the right;
 - BORDER: rows below, columns to the right;
 - ACTION: number of the column, and the actions that have it on: stride, n, value, see ``acts.act_columns``;
-- MEETING: channel, value, channel (``BEYOND``: what lies beyond the border), value, rows below, columns to the right;
+- MEETING: channel, value, channel (``BEYOND``: what lies beyond the border), value, rows below, columns to the right; a value
+  with itself at no distance: whether it is anywhere;
 - NEXT, NEXT_MEETING: a CELL and a MEETING of the next state;
 - WRAP: a CELL that lies beyond the border, and so at the other end.
 """
@@ -91,7 +92,7 @@ def _meetings(shown: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int, int,
 def known_columns(columns: Ints, before: Factors, after: Factors) -> Ints:
     """Numbers of the relative columns that may tell something, by what was met.
 
-    Values that were never met tell nothing, nor do meetings of channels that only repeat another channel's past, or that are
+    Values that never came tell nothing, nor do meetings of channels that only repeat another channel's past, or that are
     the same all over the board; of the latter one cell tells all.
 
     Args:
@@ -100,7 +101,7 @@ def known_columns(columns: Ints, before: Factors, after: Factors) -> Ints:
         after: those of the next states.
     """
     n_channels = before.shape[1]
-    met = [_values(before[:, channel]) for channel in range(n_channels)]
+    now, then = ([_values(planes[:, channel]) for channel in range(n_channels)] for planes in (before, after))
     even = {c for c in range(n_channels) if all((p[:, c] == p[:, c, :1, :1]).all() for p in (before, after))}
     live = {BEYOND} | {
         c
@@ -109,11 +110,12 @@ def known_columns(columns: Ints, before: Factors, after: Factors) -> Ints:
     }
 
     def known(kind: int, channel: int, value: int, other: int, second: int) -> bool:
+        came = then if kind in (NEXT, NEXT_MEETING) else now  # what ends an episode is never left again
         if kind in (CELL, NEXT, WRAP):
-            return value in met[channel] and (channel not in even or (kind != WRAP and (other, second) == (0, 0)))
+            return value in came[channel] and (channel not in even or (kind != WRAP and (other, second) == (0, 0)))
         if kind not in (MEETING, NEXT_MEETING):
             return True
-        return channel in live and other in live and value in met[channel] and (other == BEYOND or second in met[other])
+        return channel in live and other in live and value in came[channel] and (other == BEYOND or second in came[other])
 
     return np.flatnonzero([known(*column[:5]) for column in columns.tolist()])
 
@@ -293,7 +295,8 @@ def named_column(column: Ints) -> str:
         return f"border at ({parts[0]:+d}, {parts[1]:+d})"
     if kind in (MEETING, NEXT_MEETING):
         other = "the border" if parts[2] == BEYOND else f"channel {parts[2]} = {parts[3]}"
-        words = f"channel {parts[0]} = {parts[1]} anywhere with {other} at ({parts[4]:+d}, {parts[5]:+d})"
+        words = f"channel {parts[0]} = {parts[1]} anywhere"
+        words += "" if parts[:2] == parts[2:4] and parts[4:] == [0, 0] else f" with {other} at ({parts[4]:+d}, {parts[5]:+d})"
     else:
         words = f"channel {parts[0]} = {parts[1]} at ({parts[2]:+d}, {parts[3]:+d})"
         words += " around the board" if kind == WRAP else ""

@@ -96,3 +96,21 @@ def test_one_of_a_thousand_events_in_which_everything_changes_is_planned_with() 
     for chances in (part[2] for part in listed(model, [0, 1] * 6, 4)):
         assert chances.sum() == pytest.approx(1.0)
         assert 0.002 < chances[chances < 0.5].sum() < 0.008
+
+
+@pytest.mark.parametrize("risk", [RISK, 0.0015])
+def test_two_rare_things_that_come_together_are_one_outcome(risk: float) -> None:
+    rng = np.random.default_rng(0)
+    n = 15_000
+    action = rng.integers(2, size=n)
+    both = (action == 1) & (rng.random(n) < risk)
+    before = np.column_stack([np.zeros((n, 2), dtype=np.int64), rng.integers(2, size=(n, 2))])
+    after = np.column_stack([both, both, rng.integers(2, size=(n, 2))])
+    model = DecisionGraphModel((2, 2, 2, 2), 2)
+    model.fit(dataset((2, 2, 2, 2), 2, before, action, after, np.zeros(n, dtype=bool)))
+    states, ends, chances = listed(model, [0, 0, 0, 0], 16)[1]
+    assert not ends.any()
+    assert (states[:, 0] == states[:, 1]).all()
+    assert chances[states[:, 0] == 1].sum() == pytest.approx(both[action == 1].mean(), rel=0.1)
+    drawn, _ = model.sample(np.zeros((4000, 4), dtype=np.int64), np.ones(4000, dtype=np.int64), np.random.default_rng(1))
+    assert (drawn[:, 0] == drawn[:, 1]).all()
