@@ -92,14 +92,15 @@ class LeakyTank(Dam):
 
 @pytest.mark.parametrize("loss", [900.0, 30.0])
 def test_on_planes_a_rare_end_comes_with_the_cell_that_shows_it(loss: float) -> None:
-    agent = learned(LeakyTank(0.004, loss), "MctsPolicy", 12_000)
+    env = LeakyTank(0.004, loss)
+    agent = learned(env, "MctsPolicy", 12_000)
     rows = agent.transitions.rows()
     low, full = values_of(float(rows.terminated[rows.actions == 1].mean()), loss)
-    why = agent.explain(agent.get_env().reset()[0])
+    why = agent.explain(env.reset()[0])
     assert why.values == pytest.approx([low, full], rel=0.05)
     (burst,) = why.rare[1]
     assert burst.terminated
-    assert burst.observation[1, 2, 3] == 1
+    assert np.asarray(burst.observation)[1, 2, 3] == 1
 
 
 def test_a_rare_loss_among_flickering_lamps_is_seen_by_search() -> None:

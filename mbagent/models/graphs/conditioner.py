@@ -72,9 +72,8 @@ def probabilities(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Floa
 
 def go_together(error: Floats, other: Floats, spread: Floats, other_spread: Floats, n_tried: int) -> bool:
     """Whether two columns' errors [...] go together, given their variances [...], one of ``n_tried`` such questions."""
-    size = error.size
-    pair = (part.reshape(size, 1) for part in (error, other, spread, other_spread))
-    return bool(_telling(*pair, n_tried)[0, 0])
+    one, two, three, four = (part.reshape(-1, 1) for part in (error, other, spread, other_spread))
+    return bool(_telling(one, two, three, four, n_tried)[0, 0])
 
 
 def _telling(error: Floats, other: Floats, spread: Floats, other_spread: Floats, n_tried: int) -> Bools:
