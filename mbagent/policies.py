@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
 from mbagent.learned_reward import LearnedReward
-from mbagent.leaves import OutsideSpaceError
 from mbagent.locks import PlanningLock
 from mbagent.models.base import States, TransitionModel
 from mbagent.planning.flat_monte_carlo import FlatMonteCarlo, direct_model
@@ -21,7 +20,7 @@ from mbagent.planning.goal import Goal
 from mbagent.planning.machine_planner import MachinePlanner
 from mbagent.planning.mcts import MctsPlanner
 from mbagent.planning.planner import Plan, Planner, PlannerSettings
-from mbagent.spaces import ActionEnumeration, FactoredSpace
+from mbagent.spaces import ActionEnumeration, FactoredSpace, as_batch
 from mbagent_envs.random_keys import derive
 
 NO_GOAL = (
@@ -251,75 +250,6 @@ class ValueIterationPolicy(PlannerPolicy):
     """Greedy on the values of the finite-state machine generated from the model (section 2)."""
 
     planner_class = MachinePlanner
-
-
-def as_batch(space: spaces.Space[Any], value: Any, kind: str = "observation") -> tuple[Any, bool]:
-    """An observation (or action) as a batch, and whether it was a single one.
-
-    Raises:
-        OutsideSpaceError: it is not made of numbers, or its shape is neither that of one value of ``space`` nor of a batch.
-    """
-    if kind == "observation":
-        _refuse_returned(space, value)
-    own = f"pass {kind}s as the environment's {kind}_space declares them"
-    if isinstance(space, spaces.Dict):
-        if not isinstance(value, Mapping):
-            raise OutsideSpaceError(f"The {kind} must be a dict with the keys {sorted(space.spaces)}, got {value!r}", own)
-        lacking, surplus = space.spaces.keys() - value.keys(), value.keys() - space.spaces.keys()
-        if lacking or surplus:
-            what = f"lacks the key {min(lacking)!r}" if lacking else f"has the undeclared key {min(map(str, surplus))!r}"
-            raise OutsideSpaceError(f"The {kind} {what} (declared are {sorted(space.spaces)})", own)
-        parts = {key: as_batch(part, value[key], kind) for key, part in space.spaces.items()}
-        return {key: batch for key, (batch, _) in parts.items()}, _all_single(list(parts.values()), kind)
-    if isinstance(space, spaces.Tuple):
-        if not isinstance(value, tuple | list) or len(value) != len(space.spaces):
-            raise OutsideSpaceError(f"The {kind} must be a tuple of {len(space.spaces)} parts, got {value!r}", own)
-        pairs = [as_batch(part, each, kind) for part, each in zip(space.spaces, value, strict=True)]
-        return tuple(batch for batch, _ in pairs), _all_single(pairs, kind)
-    try:
-        array, shape = np.asarray(value), tuple(space.shape or ())
-    except ValueError:
-        array, shape = np.asarray(None), tuple(space.shape or ())  # rows of unequal length
-    if array.dtype.kind not in "biuf":
-        raise OutsideSpaceError(f"The {kind} must be numbers of {space}, got {value!r}", own)
-    if array.shape == shape:
-        return array[None], True
-    if array.shape[1:] == shape and array.ndim == len(shape) + 1:
-        return array, False
-    batched = f"(batch, {', '.join(map(str, shape))})"
-    raise OutsideSpaceError(f"The {kind} has shape {array.shape}, but {space} needs {shape}, or {batched} for a batch", own)
-
-
-def one_as_batch(space: spaces.Space[Any], value: Any, kind: str = "observation") -> Any:
-    """One observation (or action) as a batch of one.
-
-    Raises:
-        OutsideSpaceError: it is none of ``space``, or a batch.
-    """
-    batch, single = as_batch(space, value, kind)
-    if not single:
-        raise OutsideSpaceError(f"The {kind} {value!r} has one dimension more than {space} declares", f"pass one {kind}")
-    return batch
-
-
-def _all_single(parts: list[tuple[Any, bool]], kind: str) -> bool:
-    """Whether all parts are single values; OutsideSpaceError if they are not all alike, or batches of unequal length."""
-    if len({single for _, single in parts}) > 1:
-        raise OutsideSpaceError(
-            f"Some parts of the {kind} are batches and some are not", f"give one {kind}, or a batch of all parts"
-        )
-    lengths = {len(batch) for batch, _ in parts if not isinstance(batch, dict | tuple)}
-    if len(lengths) > 1:
-        raise OutsideSpaceError(f"The parts of the {kind} are batches of unequal length, {sorted(lengths)}", "give each as many")
-    return all(single for _, single in parts)
-
-
-def _refuse_returned(space: spaces.Space[Any], value: Any) -> None:
-    """Raises OutsideSpaceError if what is given for an observation is all that ``reset`` or ``step`` returned."""
-    returned = isinstance(value, tuple) and len(value) in (2, 5) and isinstance(value[-1], dict)
-    if returned and not (isinstance(space, spaces.Tuple) and isinstance(space.spaces[-1], spaces.Dict)):
-        method = "reset" if len(value) == 2 else "step"
-        raise OutsideSpaceError(f"The observation is the whole tuple that {method}() returned", "pass its first element")
 
 
 def _part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:

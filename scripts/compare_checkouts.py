@@ -85,7 +85,7 @@ def probe(case: str, seed: int) -> dict[str, str]:
 
     env_id, model, policy = CASES[case]
     env = make(env_id)
-    kwargs = {"num_simulations": 60} if policy != "ValueIterationPolicy" else {}
+    kwargs: dict[str, Any] = {"num_simulations": 60} if policy != "ValueIterationPolicy" else {}
     agent = ModelLearningAgent(policy, env, model=model, seed=seed, **kwargs).learn(STEPS, log_interval=None)
     rows = agent.transitions.rows()
     some = np.linspace(0, len(rows) - 1, N_ROWS).astype(np.int64)
@@ -140,7 +140,7 @@ def ask(args: argparse.Namespace) -> dict[str, dict[str, str]]:
     for case in args.cases:
         for seed in range(args.seeds):
             found[f"{case}, seed {seed}"] = probe(case, seed)
-            print(f"  {case}, seed {seed}", file=sys.stderr, flush=True)
+            sys.stderr.write(f"  {case}, seed {seed}\n")
     return found
 
 
@@ -174,8 +174,8 @@ def main() -> int:
     for case, was in old.items():
         wrong = [name for name, value in was.items() if new[case].get(name) != value]
         differing += bool(wrong)
-        print(f"{case}: " + (f"DIFFERS in {', '.join(wrong)}" if wrong else f"equal ({len(was)} digests)"))
-    print(f"{differing} of {len(old)} differ." if differing else f"All {len(old)} are equal.")
+        sys.stdout.write(f"{case}: " + (f"DIFFERS in {', '.join(wrong)}\n" if wrong else f"equal ({len(was)} digests)\n"))
+    sys.stdout.write(f"{differing} of {len(old)} differ.\n" if differing else f"All {len(old)} are equal.\n")
     return int(differing > 0)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mbagent import transitions
+from mbagent import transitions as data_module
 from mbagent.transitions import TransitionBatch, TransitionDataset
 
 CARDINALITIES = (2, 3, 300)
@@ -77,7 +77,7 @@ def test_a_folder_is_gone_on_with_and_what_was_cut_short_is_left_out(tmp_path: P
 
 
 def test_many_rows_of_mapped_files_are_mapped_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transitions, "_MAPPED", 50)
+    monkeypatch.setattr(data_module, "_MAPPED", 50)
     data, some = TransitionDataset(CARDINALITIES, 4, tmp_path), np.arange(0, 30, 2)
     data.append(batch(30))
     chosen = data.rows().select(some)

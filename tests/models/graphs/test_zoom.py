@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from mbagent import transitions
+from mbagent import transitions as data_module
 from mbagent.models.graphs import DecisionGraphModel, LocalGraphModel, looks, zoom
 from mbagent.models.graphs import model as graph_model
 from mbagent.models.graphs.windows import NEXT, NEXT_MEETING, Reach, column_values, relative_columns, values_at
@@ -104,7 +104,7 @@ def test_a_past_is_copied_and_tells_when_things_move() -> None:
 
 @pytest.mark.parametrize("flat", [False, True])
 def test_rows_in_files_teach_the_same(flat: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transitions, "_MAPPED", 1000)
+    monkeypatch.setattr(data_module, "_MAPPED", 1000)
     space = FactoredSpace(Maneuverer(size=3).observation_space)
     rows, fitted = played(Maneuverer(size=3), 400, 20).rows(), []
     for folder in (None, tmp_path):
