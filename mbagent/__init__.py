@@ -7,13 +7,13 @@ Importing this package registers the games ``mbagent/GeyserRunner-v0``, ``mbagen
 import mbagent_envs
 from mbagent import wrappers
 from mbagent.agent import ModelLearningAgent
-from mbagent.explanations import Explanation, Future, Step
+from mbagent.data import TransitionBatch, TransitionDataset
+from mbagent.explain import Explanation, Future, Step
 from mbagent.learned_env import LearnedEnv
 from mbagent.planning.planner import PlannerSettings
 from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
 from mbagent.rewards import RewardFn
 from mbagent.spaces import ActionEnumeration, FactoredSpace
-from mbagent.transitions import TransitionBatch, TransitionDataset
 
 __version__ = "0.1.0"
 

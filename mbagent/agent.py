@@ -1,18 +1,21 @@
-"""ModelLearningAgent: explore, fit, plan. The only room that knows all the others."""
+"""The agent: it explores, fits a transition model to what it observed, and plans."""
 
 from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, ClassVar, Self, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, cast, runtime_checkable
 
 import numpy as np
 import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
 from mbagent.arguments import (
@@ -28,21 +31,173 @@ from mbagent.arguments import (
     fitting_model,
     planner_settings,
 )
-from mbagent.experience import Experience, ExperienceRecorder, distinct_rows, warn_of_forgetting
-from mbagent.explanations import Explanation, explain
-from mbagent.exploration import EXPLORATIONS, Exploration, Watching, catch_up
-from mbagent.goals import GoalBook
-from mbagent.learned_reward import LearnedReward
-from mbagent.models.base import FitReport, TransitionModel
-from mbagent.models.factory import build_model
+from mbagent.checkpoint import SavableAlgorithm
+from mbagent.data import Experience, ExperienceRecorder, TransitionDataset, distinct_rows, warn_of_forgetting
+from mbagent.environments import ENDED, has_ended, naming_ended_processes, step, wrap_env
+from mbagent.explain import Explanation, explain
+from mbagent.exploration.strategies import EXPLORATIONS, Exploration, Watching, catch_up
+from mbagent.models.base import FitReport
+from mbagent.models.neural.connections import PruningConfig, check_fraction
+from mbagent.models.protocol import TransitionModel
+from mbagent.models.registry import build_model
+from mbagent.models.reward import LearnedReward
 from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
-from mbagent.pruned import PrunableAlgorithm
-from mbagent.reporting import check_progress, fit_progress, log_fit, log_rollout
-from mbagent.rewards import RewardFn
+from mbagent.rewards import GoalBook, RewardFn
 from mbagent.spaces import ActionEnumeration, FactoredSpace
-from mbagent.subprocesses import ENDED, has_ended, naming_ended_processes, step
-from mbagent.transitions import TransitionDataset
-from mbagent.wrapping import wrap_env
+
+if TYPE_CHECKING:
+    pass
+
+
+def check_progress(show: bool) -> None:
+    """Whether a progress bar can be shown, if one is asked for.
+
+    Raises:
+        ImportError: a package is missing; the message names the pip line.
+    """
+    if not show:
+        return
+    try:
+        import rich  # noqa: F401, PLC0415 - optional
+        import tqdm  # noqa: F401, PLC0415 - optional
+    except ImportError as error:
+        raise ImportError(
+            f'progress_bar=True needs the package {error.name}: pip install "mbagent[progress]", or learn without the bar.'
+        ) from error
+
+
+@contextmanager
+def fit_progress(show: bool) -> Iterator[Callable[[float], None] | None]:
+    """A function to tell the share of a fit that is done, shown as a bar; None without ``show``, see ``check_progress``."""
+    if not show:
+        yield None
+        return
+    from tqdm.auto import tqdm  # noqa: PLC0415 - optional
+
+    with tqdm(total=100, desc="fitting the model", unit="%") as bar:
+
+        def tell(share: float) -> None:
+            bar.update(round(100 * share) - bar.n)
+
+        yield tell
+        bar.update(100 - bar.n)
+
+
+def log_fit(logger: Logger, report: FitReport, n_updates: int, n_transitions: int, n_start_states: int) -> None:
+    """Writes the ``train/`` and ``model/`` figures of a fit to the log.
+
+    Args:
+        logger: SB3's logger.
+        report: what the fit did.
+        n_updates: fits so far.
+        n_transitions: transitions met so far.
+        n_start_states: distinct start states known.
+    """
+    figures = {
+        "predictor_loss": report.predictor_loss,
+        "conditioner_loss": report.conditioner_loss,
+        "exact_match": report.exact_match,
+        "calibration": report.calibration,
+        "memory": report.memory,
+        "epochs": report.epochs,
+        "fit_seconds": report.seconds,
+    }
+    for name, value in figures.items():
+        if value is not None:
+            logger.record(f"train/{name}", value)
+    logger.record("train/n_updates", n_updates, exclude="tensorboard")
+    logger.record("model/transitions", n_transitions)
+    logger.record("model/start_states", n_start_states)
+    for name, value in report.log.items():
+        logger.record(f"model/{name}", value)
+
+
+def log_rollout(agent: BaseAlgorithm, began: float, steps_before: int) -> None:
+    """Writes the ``rollout/`` and ``time/`` figures to the agent's log.
+
+    Args:
+        agent: whose buffers of episodes are read.
+        began: when ``learn`` began, nanoseconds since the epoch.
+        steps_before: environment steps before that.
+    """
+    seconds, logger = max((time.time_ns() - began) / 1e9, 1e-9), agent.logger
+    if agent.ep_info_buffer:
+        logger.record("rollout/ep_rew_mean", safe_mean([info["r"] for info in agent.ep_info_buffer]))
+        logger.record("rollout/ep_len_mean", safe_mean([info["l"] for info in agent.ep_info_buffer]))
+    if agent.ep_success_buffer:
+        logger.record("rollout/success_rate", safe_mean(agent.ep_success_buffer))
+    logger.record("time/fps", int((agent.num_timesteps - steps_before) / seconds))
+    logger.record("time/time_elapsed", int(seconds), exclude="tensorboard")
+    logger.record("time/total_timesteps", agent.num_timesteps, exclude="tensorboard")
+
+
+@runtime_checkable
+class PrunableModel(Protocol):
+    """A transition model that has connections to remove; see ``NeuralTransitionModel.prune``."""
+
+    def prune(
+        self,
+        data: TransitionDataset,
+        fraction: float,
+        *,
+        seed: int = 0,
+        progress: Callable[[float], None] | None = None,
+        config: PruningConfig | None = None,
+    ) -> FitReport:
+        """Removes connections and trains what is left; leaves the model as it was where that fails."""
+        ...
+
+
+class PrunableAlgorithm(SavableAlgorithm):
+    """What ModelLearningAgent does to make its model smaller."""
+
+    def prune(self, fraction: float, *, progress_bar: bool = False, config: PruningConfig | None = None) -> Self:
+        """Removes the smallest weights of the model's networks, trains what is left on the transitions met, and plans on with it.
+
+        Each network loses this share of its connections, and those left over that the transitions do not call for; the goal
+        stays. Pruned again, the agent goes on from what is left. ``learn`` fits anew, with all connections.
+
+        Args:
+            fraction: least share of the connections that are gone afterwards, 0 or more and less than 1.
+            progress_bar: shows one.
+            config: how, see PruningConfig; ``PruningConfig(evidence=False)`` removes this share and no more.
+
+        Raises:
+            ValueError: a fraction out of range, nothing learned yet, or no transitions to train on (after ``load``).
+            TypeError: the model has no weights. The agent is as it was in each of these cases, as after any other error.
+        """
+        agent = cast("ModelLearningAgent", self)
+        fraction, model = check_fraction(fraction), prunable(agent.model)
+        if not agent.policy.fitted:
+            raise ValueError("There is nothing to prune yet: call learn() first.")
+        if not len(agent.experience.dataset):
+            raise ValueError(
+                "prune() trains what is left on the transitions met, and this agent has none: give it some with "
+                "load_transitions(path), or save agents with include=['transitions']."
+            )
+        with agent.policy.lock, fit_progress(progress_bar) as progress:
+            report = model.prune(agent.transitions, fraction, seed=agent._planning_seed, progress=progress, config=config)
+            agent._n_updates += 1
+            agent.fit_report = report
+            agent._refresh()
+        if hasattr(agent, "_logger"):  # a loaded agent has none before it learns
+            log_fit(agent.logger, report, agent._n_updates, len(agent.transitions), len(agent.policy.start_states))
+        return self
+
+
+def prunable(model: TransitionModel) -> PrunableModel:
+    """The model, if it can be pruned.
+
+    Raises:
+        TypeError: it has no weights; the message says what to do.
+    """
+    if isinstance(model, PrunableModel):
+        return model
+    raise TypeError(
+        f"This agent's model, {type(model).__name__}, has no connections to prune: decision graphs and tables hold only what the "
+        "data called for. Learn with model='networks' or model='paper' to prune networks."
+    )
+
 
 ITERATION_STEPS = 1000
 """Environment steps between two looks at the logger."""

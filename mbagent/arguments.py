@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
-from mbagent.exploration import EXPLORATIONS, Exploration
-from mbagent.models.base import TransitionModel
+from mbagent.exploration.strategies import EXPLORATIONS, Exploration
+from mbagent.models.protocol import TransitionModel
 from mbagent.planning.planner import PlannerSettings
 from mbagent.spaces import FactoredSpace
 

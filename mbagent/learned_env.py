@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.arguments import check_count
-from mbagent.models.base import Actions, States
-from mbagent.policies import NO_GOAL, PlannerPolicy, as_batch
+from mbagent.policies import NO_GOAL, PlannerPolicy
 from mbagent.rewards import GivenReward, RewardFn
+from mbagent.spaces import as_batch
+from mbagent.types import Actions, States
 
 if TYPE_CHECKING:
     from mbagent.agent import ModelLearningAgent

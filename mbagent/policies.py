@@ -12,15 +12,14 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
-from mbagent.learned_reward import LearnedReward
 from mbagent.locks import PlanningLock
-from mbagent.models.base import States, TransitionModel
+from mbagent.models.protocol import TransitionModel
+from mbagent.models.reward import LearnedReward
 from mbagent.planning.flat_monte_carlo import FlatMonteCarlo, direct_model
-from mbagent.planning.goal import Goal
-from mbagent.planning.machine_planner import MachinePlanner
-from mbagent.planning.mcts import MctsPlanner
 from mbagent.planning.planner import Plan, Planner, PlannerSettings
+from mbagent.planning.planners import MachinePlanner, MctsPlanner
 from mbagent.spaces import ActionEnumeration, FactoredSpace, as_batch
+from mbagent.types import Reward, States
 from mbagent_envs.random_keys import derive
 
 NO_GOAL = (
@@ -85,12 +84,12 @@ class PlannerPolicy(BasePolicy):
             raise ValueError("reuse_tree is for the MctsPolicy; other planners keep no tree.")
         self.planner: Planner = self.planner_class(settings)
         self.start_states: States = np.zeros((0, len(self.factored)), dtype=np.int64)
-        self.goal: Goal | None = None
+        self.goal: Reward | None = None
         self.fitted = False
         self._warned = False
         self._random = np.random.default_rng(int(derive(settings.seed, 0xAC71)[0]))
 
-    def refresh(self, goal: Goal | None = None) -> None:
+    def refresh(self, goal: Reward | None = None) -> None:
         """Drops every cache after new weights or start states; takes a new goal if one is given."""
         with self.lock:
             self.planner.set_model(self.transition_model, self.start_states)
@@ -109,7 +108,7 @@ class PlannerPolicy(BasePolicy):
             self.start_states, self.fitted, self.goal = start_states, fitted, None
             self.refresh()
 
-    def set_goal(self, goal: Goal | None) -> None:
+    def set_goal(self, goal: Reward | None) -> None:
         """Takes a goal (None: none is known, so ``predict`` refuses)."""
         with self.lock:
             self.goal = goal

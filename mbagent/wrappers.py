@@ -11,8 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mbagent.leaves import MAX_DECLARED
-from mbagent.spaces import ActionEnumeration, FactoredSpace
+from mbagent.spaces import MAX_DECLARED, ActionEnumeration, FactoredSpace
 
 
 class History(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):

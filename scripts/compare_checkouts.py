@@ -1,10 +1,11 @@
-"""Compares two checkouts byte for byte: experience, weights, draws, probabilities, successors and plans.
+"""Compares two checkouts byte for byte.
 
 python scripts/compare_checkouts.py OLD NEW              # three seeds; about ten minutes each on one core
 python scripts/compare_checkouts.py OLD NEW --seeds 1 --cases "FrozenLake, auto"
 
-Both run with this Python and its libraries, one after the other. A refactoring that changes no number prints "equal" for each case.
-Names of arrays are not compared, only what they hold, so that they may be renamed.
+Experience, weights, draws, probabilities, successors and plans are compared. Both checkouts run with this Python and its
+libraries, one after the other. A refactoring that changes no number prints "equal" for each case. Names of arrays are not
+compared, only what they hold, so that they may be renamed.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from mbagent.analysis.external.coverage import Row, Study, draw_coverage, run_st
 from mbagent.analysis.external.worlds import exact_world, find_world
 from mbagent.analysis.folders import check_run, open_folder, write_csv
 from mbagent.analysis.parallel import run_all
-from mbagent.exploration import EXPLORATIONS
+from mbagent.exploration.strategies import EXPLORATIONS
 
 
 @dataclass(frozen=True)

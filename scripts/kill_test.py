@@ -33,7 +33,7 @@ from rich.console import Console
 from rich.progress import track
 
 import mbagent
-from mbagent.transitions import TransitionBatch, TransitionDataset
+from mbagent.data import TransitionBatch, TransitionDataset
 
 GAME = "mbagent/FlierCatcher-v0"
 N_FACTORS = 120

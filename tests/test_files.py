@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mbagent import files, persistence
-from mbagent.transitions import TransitionDataset
-from tests.test_transitions import CARDINALITIES, batch, same
+from mbagent import checkpoint, files
+from mbagent.data import TransitionDataset
+from tests.test_data import CARDINALITIES, batch, same
 
 STEPS = {"fsync", "truncate", "rename", "replace", "flock", "mkdir", "unlink"}
 """Calls before each of which a writer is killed; and before every tenth ``write``."""
@@ -50,11 +50,11 @@ def dataset(n: int) -> TransitionDataset:
 
 
 def written_agent(path: Path, n: int) -> None:
-    persistence.write(path, {"n": n}, {"policy": {"weights": np.full(n, n)}})
+    checkpoint.write(path, {"n": n}, {"policy": {"weights": np.full(n, n)}})
 
 
 def agent_rows(path: Path) -> int:
-    data, arrays = persistence.read(path)
+    data, arrays = checkpoint.read(path)
     assert arrays["policy"]["weights"].tolist() == [data["n"]] * data["n"]
     return int(data["n"])
 
@@ -285,7 +285,7 @@ def test_open_files_are_written_to_and_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "act", [lambda p: dataset(3).save(p), lambda p: written_agent(p, 3), TransitionDataset.load, persistence.read]
+    "act", [lambda p: dataset(3).save(p), lambda p: written_agent(p, 3), TransitionDataset.load, checkpoint.read]
 )
 def test_no_path_at_all_is_told_in_one_sentence(act: Callable[[Any], None]) -> None:
     for wrong in (None, 3):
@@ -299,7 +299,7 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"no file .*rows or .*rows\.npz"):
         TransitionDataset.load(tmp_path / "rows")
     with pytest.raises(FileNotFoundError, match=r"no file .*agent\.zip;"):
-        persistence.read(tmp_path / "agent.zip")
+        checkpoint.read(tmp_path / "agent.zip")
 
 
 def test_files_that_are_no_table_are_told_to_be_none_without_advice_to_read_pickles(tmp_path: Path) -> None:

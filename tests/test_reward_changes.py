@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from mbagent.learned_reward import LearnedReward
-from mbagent.reward_changes import triples, turn, wrong_until
+from mbagent.data import TransitionBatch
+from mbagent.models.reward import LearnedReward
+from mbagent.models.reward_changes import triples, turn, wrong_until
 from mbagent.spaces import FactoredSpace
-from mbagent.transitions import TransitionBatch
-from tests.test_learned_reward import pictures
+from tests.models.test_reward import pictures
 
 SIZE = 10
 

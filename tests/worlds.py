@@ -8,13 +8,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from mbagent.models.base import BaseTransitionModel, FitReport, Randomness, Successors, as_keys
+from mbagent.data import TransitionDataset
+from mbagent.models.base import BaseTransitionModel, FitReport
+from mbagent.models.protocol import Successors, as_keys
 from mbagent.planning.planner import Planner
-from mbagent.transitions import TransitionDataset
+from mbagent.types import Floats, Ints, Randomness
 from mbagent_envs.random_keys import uniforms
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 
 class TableWorld(BaseTransitionModel):

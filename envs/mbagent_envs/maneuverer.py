@@ -7,8 +7,9 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from mbagent_envs._compiled import compiled
-from mbagent_envs.game import Bits, Floats, Game, Ints, Scene, Sprite, as_floats, check_integer, check_number
+from mbagent.types import Floats, Ints
+from mbagent_envs.game import Bits, Game, Scene, Sprite, as_floats, check_integer, check_number
+from mbagent_envs.jit import compiled
 from mbagent_envs.random_keys import KeyArray, uniform_at
 
 ROW_MOVES = np.array([-1, 0, 1, 0], dtype=np.int64)

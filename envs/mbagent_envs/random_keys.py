@@ -8,10 +8,13 @@ outcome alone, in a batch, on another thread, or replayed later. Mixing is the f
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
+from numpy.typing import NDArray
 
-from mbagent_envs._compiled import compiled
+from mbagent_envs.jit import compiled
 
 KeyArray = npt.NDArray[np.uint64]
 
@@ -125,3 +128,10 @@ def derive(keys: npt.ArrayLike, *salt: npt.ArrayLike) -> KeyArray:
 def draw_keys(rng: np.random.Generator, n: int) -> KeyArray:
     """Draw ``n`` fresh keys, uint64 ``[n]``, from a generator."""
     return rng.integers(0, 2**64, size=n, dtype=np.uint64)
+
+
+def hash_rows(values: NDArray[Any]) -> NDArray[np.uint64]:
+    """A 64-bit hash [N] of each integer row [N, F]; equal rows have equal hashes."""
+    weights = derive(np.arange(values.shape[1], dtype=np.uint64), 0x5851F42D)
+    mixed = values.astype(np.uint64) + np.uint64(1)
+    return derive((mixed * (weights | np.uint64(1))).sum(axis=1, dtype=np.uint64), 1)

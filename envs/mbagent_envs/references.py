@@ -12,10 +12,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mbagent_envs._compiled import compiled
+from mbagent.types import Floats, Ints
 from mbagent_envs.flier_catcher import FlierCatcher
-from mbagent_envs.game import Bits, Floats, Game, Ints, RewardFn
+from mbagent_envs.game import Bits, Game, RewardFn
 from mbagent_envs.geyser_runner import GeyserRunner
+from mbagent_envs.jit import compiled
 from mbagent_envs.maneuverer import Maneuverer
 from mbagent_envs.random_keys import derive
 

@@ -12,15 +12,7 @@ from rich.console import Console
 from mbagent import files
 from mbagent.analysis.cases import CASES, Case, find_case
 from mbagent.analysis.jobs import Job, all_goals
-from mbagent.analysis.records import (
-    AGENT,
-    LEARNED_REWARD,
-    RANDOM,
-    REFERENCE,
-    TRUE_MODEL,
-    Record,
-    read_records,
-)
+from mbagent.analysis.records import AGENT, LEARNED_REWARD, RANDOM, REFERENCE, TRUE_MODEL, Record, read_records
 from mbagent.analysis.runner import run_jobs
 
 BASELINES = ("PPO", "DQN", "A2C")

@@ -19,15 +19,7 @@ from mbagent import ModelLearningAgent
 from mbagent.analysis.baselines import BaselineName, as_policy, best_mode, train_baseline
 from mbagent.analysis.cases import Case, find_case, game_of, goals_of, measure_scale, play
 from mbagent.analysis.evaluation import Policy, milliseconds_per_decision, random_policy
-from mbagent.analysis.records import (
-    AGENT,
-    LEARNED_REWARD,
-    RANDOM,
-    REFERENCE,
-    TRUE_MODEL,
-    Record,
-    hash_weights,
-)
+from mbagent.analysis.records import AGENT, LEARNED_REWARD, RANDOM, REFERENCE, TRUE_MODEL, Record, hash_weights
 from mbagent.models import SimulatorModel
 
 Report = Callable[[float], None]

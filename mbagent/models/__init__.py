@@ -1,14 +1,14 @@
 """Transition models: the paper's predictor and conditioner, tables, and the true simulator behind one protocol."""
 
-from mbagent.models.base import BaseTransitionModel, FitReport, Successors, TransitionModel
-from mbagent.models.config import NeuralConfig
-from mbagent.models.factory import build_model, register_model
-from mbagent.models.networks import Conditioner, DensePredictor, FactorCodec, Predictor
-from mbagent.models.neural import NeuralTransitionModel
-from mbagent.models.planes import PlanePredictor
+from mbagent.models.base import BaseTransitionModel, FitReport
+from mbagent.models.neural.model import NeuralTransitionModel
+from mbagent.models.neural.network_pair import NeuralConfig
+from mbagent.models.neural.networks import Conditioner, DensePredictor, FactorCodec, PlanePredictor, Predictor
+from mbagent.models.neural.training import TrainingConfig
+from mbagent.models.protocol import Successors, TransitionModel
+from mbagent.models.registry import build_model, register_model
 from mbagent.models.simulator import SimulatorModel
 from mbagent.models.tabular import TabularModel
-from mbagent.models.training import TrainingConfig
 
 __all__ = [
     "BaseTransitionModel",

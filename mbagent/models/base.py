@@ -1,4 +1,4 @@
-"""The parts that every model shares: successors and moments from samples (paper section 2)."""
+"""The parts that every model shares: successors and moments from samples (paper section 2), and models with known rules."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent.data import TransitionDataset
 from mbagent.models.fit_report import FitReport as FitReport
-from mbagent.models.reachable import ReachableMDP, reachable_mdp
-from mbagent.models.protocol import Actions, Bools, Floats, Randomness, States, Successors, merge_draws
-from mbagent.transitions import TransitionDataset
+from mbagent.models.mdp import ReachableMDP, reachable_mdp
+from mbagent.models.protocol import Successors, merge_draws
+from mbagent.types import Actions, Bools, Floats, Randomness, States
 from mbagent_envs.random_keys import derive
 
 
@@ -105,3 +106,26 @@ class BaseTransitionModel(ABC):
         values = np.asarray(of(next_states) if of else next_states, dtype=np.float64)
         values = values.reshape(len(states), n_samples, *values.shape[1:])
         return values.mean(axis=1), values.var(axis=1, ddof=1)
+
+
+class KnownModel(BaseTransitionModel):
+    """A model of known rules: ``fit`` does nothing and ``state_dict`` is empty; see BaseTransitionModel for the arguments."""
+
+    def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
+        """Does nothing: the rules are known."""
+        if progress is not None:
+            progress(1.0)
+        return FitReport(n_train=len(data), n_validation=0, epochs=0, seconds=0.0)
+
+    def state_dict(self) -> dict[str, NDArray[Any]]:
+        """Empty."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Takes the empty mapping.
+
+        Raises:
+            ValueError: there are weights in it.
+        """
+        if state:
+            raise ValueError(f"A model of known rules has no weights, but was given {sorted(state)[0]!r} and perhaps more.")

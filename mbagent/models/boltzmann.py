@@ -20,10 +20,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mbagent.models.base import Actions, BaseTransitionModel, Bools, FitReport, Floats, Randomness, States, as_keys
-from mbagent.models.networks import FactorCodec, uniform
-from mbagent.models.training import Examples, batches, examples, one_cycle, one_thread
-from mbagent.transitions import TransitionDataset
+from mbagent.data import TransitionDataset
+from mbagent.models.base import BaseTransitionModel, FitReport
+from mbagent.models.neural.networks import FactorCodec, uniform
+from mbagent.models.neural.training import Examples, batches, examples, one_cycle, one_thread
+from mbagent.models.protocol import as_keys
+from mbagent.types import Actions, Bools, Floats, Randomness, States
 from mbagent_envs.random_keys import derive, uniforms
 
 ENUMERATED = 4096

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.transitions import TransitionBatch
-
-Floats = NDArray[np.float64]
+from mbagent.data import TransitionBatch
+from mbagent.types import Floats
 
 BINS = 10
 """Bins of predicted probabilities that are held against frequencies."""

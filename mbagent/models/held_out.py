@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.transitions import TransitionBatch, TransitionDataset
+from mbagent.data import TransitionBatch, TransitionDataset
 
 SOME_ROWS, SOME_TESTS = 2500, 1000
 """Transitions learned from and held out to look at a question such as this one."""

@@ -15,10 +15,10 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent.data import TransitionDataset
 from mbagent.models.fit_report import FitReport
-from mbagent.transitions import TransitionDataset
 from mbagent.types import Actions, Bools, Floats, Keys, Randomness, States
-from mbagent_envs.random_keys import derive
+from mbagent_envs.random_keys import derive, hash_rows
 
 LARGEST_NUMBER = 2**62
 """Actions, and strings of actions that are one action of a model, are numbered up to here."""
@@ -96,13 +96,6 @@ def as_keys(rng: Randomness, n: int) -> Keys:
     if len(rng) != n:
         raise ValueError(f"{len(rng)} random keys were given for {n} rows; give one key a row.")
     return rng
-
-
-def hash_rows(values: NDArray[Any]) -> NDArray[np.uint64]:
-    """A 64-bit hash [N] of each integer row [N, F]; equal rows have equal hashes."""
-    weights = derive(np.arange(values.shape[1], dtype=np.uint64), 0x5851F42D)
-    mixed = values.astype(np.uint64) + np.uint64(1)
-    return derive((mixed * (weights | np.uint64(1))).sum(axis=1, dtype=np.uint64), 1)
 
 
 def merge_draws(rows: NDArray[np.int64], n_rows: int, states: States, terminated: Bools, weights: Floats) -> Successors:

@@ -5,18 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.base import (
-    Actions,
-    Bools,
-    Floats,
-    Randomness,
-    States,
-    Successors,
-    as_keys,
-)
-from mbagent.models.known import KnownModel
-from mbagent.models.thinning import thin
+from mbagent.models.base import KnownModel
+from mbagent.models.protocol import Successors, as_keys
+from mbagent.models.systematic_sampling import thin
 from mbagent.spaces import FactoredSpace
+from mbagent.types import Actions, Bools, Floats, Randomness, States
 from mbagent_envs import Game
 from mbagent_envs.random_keys import derive
 

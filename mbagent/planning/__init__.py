@@ -1,1 +1,1 @@
-"""Planners: Monte Carlo tree search, two kinds of it, flat Monte Carlo, and value iteration on the reachable machine."""
+"""Planners: value iteration on the reachable MDP, Monte Carlo tree search, and flat Monte Carlo."""

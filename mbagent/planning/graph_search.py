@@ -10,23 +10,19 @@ Shapes: N nodes, M edges, A actions, F factors, R roots, W simulations in a wave
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mbagent.models.base import States
-from mbagent.models.state_graph import GraphArrays, StateGraph
-from mbagent.planning.leaf_values import LOWEST_KNOWN
+from mbagent.models.mdp import GraphArrays, StateGraph
 from mbagent.planning.lookahead import grow_lookahead
-from mbagent.planning.machine_planner import Imagined, MachinePlanner
 from mbagent.planning.machine_search import BOUND_BELOW, BOUND_TOP, MOST_COUNTED
+from mbagent.planning.planners import Imagined, MachinePlanner
+from mbagent.planning.value_function import LOWEST_KNOWN
 from mbagent.planning.value_iteration import TOLERANCE, Values, bellman, break_ties, score_edges, settle, sweep
-from mbagent_envs._compiled import borrowed, compiled, inlined
+from mbagent.types import Floats, Ints, States
+from mbagent_envs.jit import borrowed, compiled, inlined
 from mbagent_envs.random_keys import derive, derive_one, mix
-
-Ints: TypeAlias = NDArray[np.int64]
-Floats: TypeAlias = NDArray[np.float64]
 
 FIRST_SWEEPS, GROWING_SWEEPS, FINAL_SWEEPS = 10, 3, 100
 """Sweeps of value iteration, at most: before the first simulation, after each growth of the machine, after the last one."""

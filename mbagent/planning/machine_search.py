@@ -8,17 +8,13 @@ Shapes: S states, A actions, K successors, M edges, R roots.
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mbagent_envs._compiled import borrowed, compiled, inlined
+from mbagent.types import Bools, Floats, Ints
+from mbagent_envs.jit import borrowed, compiled, inlined
 from mbagent_envs.random_keys import derive_one, mix
-
-Ints: TypeAlias = NDArray[np.int64]
-Floats: TypeAlias = NDArray[np.float64]
-Bools: TypeAlias = NDArray[np.bool_]
 
 DEPTH = 3
 """Steps of a simulation, at most, where nothing else is said."""

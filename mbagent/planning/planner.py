@@ -8,8 +8,8 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from mbagent.models.base import Actions, Floats, States, TransitionModel
-from mbagent.planning.goal import Goal
+from mbagent.models.protocol import TransitionModel
+from mbagent.types import Actions, Floats, Reward, States
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class Planner(Protocol):
         """Takes a (newly fitted) model and the start states int64 [S, F] seen; every cache is dropped."""
         ...
 
-    def set_goal(self, goal: Goal) -> None:
+    def set_goal(self, goal: Reward) -> None:
         """Takes a new goal; values of the old one are dropped, what was imagined of the world may stay."""
         ...
 

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.base import Bools, Floats, States, TransitionModel
-from mbagent.models.reachable import grow_reachable
-from mbagent.models.state_graph import GraphArrays, Indices, StateGraph
-from mbagent.planning.goal import Goal
-from mbagent.planning.leaf_values import LOWEST_KNOWN, LeafValues, evaluate
+from mbagent.models.mdp import GraphArrays, StateGraph, grow_reachable
+from mbagent.models.protocol import TransitionModel
 from mbagent.planning.planner import best_actions
-from mbagent_envs._compiled import compiled
+from mbagent.planning.value_function import LOWEST_KNOWN, LeafValues, evaluate
+from mbagent.types import Bools, Floats, Ints, Reward, States
+from mbagent_envs.jit import compiled
 
 TOLERANCE = 1e-7
 """Sweeps stop when no value moves by more than this share of the largest expected reward."""
@@ -45,7 +44,7 @@ class Values:
     leaf: LeafValues = LOWEST_KNOWN
 
 
-def score_edges(graph: StateGraph, goal: Goal, start: int = 0) -> Floats:
+def score_edges(graph: StateGraph, goal: Reward, start: int = 0) -> Floats:
     """Rewards [M - start] of the graph's successor edges from number ``start`` on, in one call of the goal."""
     if graph.n_edges == start:
         return np.zeros(0)
@@ -54,7 +53,7 @@ def score_edges(graph: StateGraph, goal: Goal, start: int = 0) -> Floats:
     return goal(states.take(sources, axis=0), graph.actions[start:], states.take(next_nodes, axis=0))
 
 
-def solve(graph: StateGraph, goal: Goal, gamma: float, n_groups: int = 1, leaf: LeafValues = LOWEST_KNOWN) -> Values:
+def solve(graph: StateGraph, goal: Reward, gamma: float, n_groups: int = 1, leaf: LeafValues = LOWEST_KNOWN) -> Values:
     """Value iteration from scratch.
 
     States that were never expanded are worth what ``leaf`` says; where it says nothing, the lowest of their group's
@@ -163,7 +162,7 @@ def sweep(
             break
 
 
-def break_ties(graph: StateGraph, q: Floats, roots: Indices, gamma: float) -> Floats:
+def break_ties(graph: StateGraph, q: Floats, roots: Ints, gamma: float) -> Floats:
     """Scores [R, A] of the roots' actions: their values, but of equally good ones that which leads somewhere new is ahead.
 
     Where nothing in sight makes a difference, the best chance is what lies beyond: among behaviours that lose nothing,
@@ -297,7 +296,7 @@ class Machine:
         self.values: Values | None = None
         self.bounds: Floats | None = None
 
-    def set_goal(self, goal: Goal, gamma: float) -> None:
+    def set_goal(self, goal: Reward, gamma: float) -> None:
         """Solves the machine for a goal."""
         if self.graph is not None:
             self.values = solve(self.graph, goal, gamma)

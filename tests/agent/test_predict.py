@@ -10,7 +10,7 @@ import pytest
 from gymnasium import spaces
 
 from mbagent import ModelLearningAgent
-from mbagent.planning.mcts import MctsPlanner
+from mbagent.planning.planners import MctsPlanner
 from tests.worlds import Corridor
 
 CATCHER = "mbagent/FlierCatcher-v0"

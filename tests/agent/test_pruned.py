@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from mbagent import ModelLearningAgent
-from mbagent.models.config import NeuralConfig
-from mbagent.models.factory import register_model
-from mbagent.models.neural import NeuralTransitionModel
-from mbagent.models.pruning import PruningConfig
-from mbagent.models.training import TrainingConfig
+from mbagent.models.neural.connections import PruningConfig
+from mbagent.models.neural.model import NeuralTransitionModel
+from mbagent.models.neural.network_pair import NeuralConfig
+from mbagent.models.neural.training import TrainingConfig
+from mbagent.models.registry import register_model
 from mbagent.spaces import FactoredSpace
 
 

@@ -10,8 +10,8 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3 import PPO
 
-from mbagent import ModelLearningAgent, persistence
-from mbagent.models.factory import build_graphs, register_model
+from mbagent import ModelLearningAgent, checkpoint
+from mbagent.models.registry import build_graphs, register_model
 from tests.worlds import Corridor, TableWorld, random_table
 
 GEYSER = "mbagent/GeyserRunner-v0"
@@ -129,7 +129,7 @@ def test_the_file_holds_json_and_plain_arrays_only(agent: ModelLearningAgent) ->
 
 def test_a_file_with_code_in_it_is_refused_by_the_entrys_name(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "pickle.zip", "w") as archive:
-        archive.writestr("data", json.dumps({"format": persistence.FORMAT}))
+        archive.writestr("data", json.dumps({"format": checkpoint.FORMAT}))
         archive.writestr("policy.pth", b"")
     with pytest.raises(ValueError, match=r"\.pth.*pickle"):
         ModelLearningAgent.load(tmp_path / "pickle.zip")
@@ -178,7 +178,7 @@ def test_custom_models_are_saved_only_when_registered(tmp_path: Path) -> None:
     ],
 )
 def test_spaces_survive_json(space: spaces.Space[Any]) -> None:
-    assert persistence.space_from_json(json.loads(json.dumps(persistence.space_to_json(space)))) == space
+    assert checkpoint.space_from_json(json.loads(json.dumps(checkpoint.space_to_json(space)))) == space
 
 
 def test_transitions_travel_in_plain_files(agent: ModelLearningAgent, tmp_path: Path) -> None:

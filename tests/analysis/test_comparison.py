@@ -14,16 +14,7 @@ from mbagent.analysis.cases import find_case
 from mbagent.analysis.comparison import FULL, QUICK, Settings, load, plan_jobs, run
 from mbagent.analysis.jobs import Job, RewardOnly, run_job
 from mbagent.analysis.pages import format_interval, format_number
-from mbagent.analysis.records import (
-    AGENT,
-    LEARNED_REWARD,
-    RANDOM,
-    TRUE_MODEL,
-    Record,
-    hash_weights,
-    read_records,
-    write_records,
-)
+from mbagent.analysis.records import AGENT, LEARNED_REWARD, RANDOM, TRUE_MODEL, Record, hash_weights, read_records, write_records
 from mbagent.analysis.report import write_report
 from mbagent.analysis.runner import JobsFailedError, run_jobs
 from mbagent.analysis.statistics import Interval

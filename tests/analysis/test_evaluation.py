@@ -6,12 +6,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mbagent.analysis.cases import find_case, finite_horizon_value, game_of, goals_of, measure_scale, play
-from mbagent.analysis.evaluation import (
-    evaluate_env,
-    evaluate_game,
-    milliseconds_per_decision,
-    random_policy,
-)
+from mbagent.analysis.evaluation import evaluate_env, evaluate_game, milliseconds_per_decision, random_policy
 from mbagent_envs.game import Game
 
 

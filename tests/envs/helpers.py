@@ -8,8 +8,9 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from mbagent.types import Bools, Floats
 from mbagent_envs import FlierCatcher, Game, GeyserRunner, Maneuverer, RewardFn
-from mbagent_envs.game import Bits, Bools, Floats, Scene, Sprite, as_floats
+from mbagent_envs.game import Bits, Scene, Sprite, as_floats
 from mbagent_envs.random_keys import KeyArray, derive, uniforms
 from mbagent_envs.references import ReferencePolicy
 

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from mbagent.types import Ints
 from mbagent_envs import FlierCatcher, Game, GeyserRunner, Maneuverer, RewardFn
-from mbagent_envs.game import Bits, Ints
+from mbagent_envs.game import Bits
 from mbagent_envs.references import geyser_states, geyser_values, reference_policy
 from tests.envs.helpers import DEFAULTS, GAMES, Lottery, returns, wandered_states
 from tests.envs.test_maneuverer import board

@@ -4,16 +4,12 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.models import NeuralConfig, NeuralTransitionModel, SimulatorModel, TrainingConfig
-from mbagent.transitions import TransitionBatch, TransitionDataset
+from mbagent.types import Bools, Floats, Ints
 from mbagent_envs import Game
 from mbagent_envs.random_keys import draw_keys
-
-Ints = NDArray[np.int64]
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 MIXED = (2, 3, 2, 4)
 """Cardinalities of a small mixed world."""

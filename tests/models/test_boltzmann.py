@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from mbagent.models.base import TransitionModel
+from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.models.boltzmann import BoltzmannConfig, ConditionalBoltzmannMachine
-from mbagent.transitions import TransitionBatch, TransitionDataset
+from mbagent.models.protocol import TransitionModel
 from mbagent_envs.random_keys import derive
 
 SMALL = BoltzmannConfig(hidden=6, min_steps=400, max_steps=400)

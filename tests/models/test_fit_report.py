@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from mbagent.models.dbn import DecisionGraphModel, LocalGraphModel
+from mbagent.models.dbn.features import acts_of
 from mbagent.models.fit_report import calibration_error
-from mbagent.models.graphs import DecisionGraphModel, LocalGraphModel
-from mbagent.models.graphs.acts import acts_of
-from mbagent.models.memory import following_steps, steps_in_a_row, with_past
+from mbagent.models.markov_test import following_steps, steps_in_a_row, with_past
 from mbagent.spaces import FactoredSpace
 from tests.models.helpers import dataset
 

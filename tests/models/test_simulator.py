@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from mbagent.data import TransitionDataset
 from mbagent.models import SimulatorModel, TransitionModel
-from mbagent.transitions import TransitionDataset
 from mbagent_envs import FlierCatcher, Game, GeyserRunner, Maneuverer
 from mbagent_envs.random_keys import derive
 from tests.models.helpers import played

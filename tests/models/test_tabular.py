@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from mbagent.data import TransitionDataset
 from mbagent.models import TabularModel
-from mbagent.transitions import TransitionDataset
 from mbagent_envs.random_keys import derive
 from tests.models.helpers import dataset, outcome_numbers, outcomes
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from mbagent import ModelLearningAgent
-from mbagent.models.forecasts import DirectForecastModel
-from mbagent.planning.flat_monte_carlo import FlatMonteCarlo
+from mbagent.models.neural.forecasts import DirectForecastModel
+from mbagent.planning.flat_monte_carlo import FlatMonteCarlo, forecast_returns, random_returns
 from mbagent.planning.planner import PlannerSettings
-from mbagent.planning.rollouts import forecast_returns, random_returns
 from mbagent_envs.random_keys import derive, uniforms
 from tests.worlds import TableWorld, arrival_goal, random_table
 

@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from mbagent.planning.graph_search import GraphSearch
-from mbagent.planning.machine_planner import MachinePlanner
 from mbagent.planning.planner import Planner, PlannerSettings
-from tests.worlds import Floats, optimal_q, planner_for, prize_corridor, random_table
+from mbagent.planning.planners import MachinePlanner
+from mbagent.types import Floats
+from tests.worlds import optimal_q, planner_for, prize_corridor, random_table
 
 
 def planner_alone(planner: Planner, table: Floats, rewards: Floats, ends: tuple[int, ...] = ()) -> Planner:

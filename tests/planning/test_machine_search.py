@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from mbagent.planning.machine_search import KnownMachine, known_machine, search_machine
-from tests.worlds import Floats, optimal_q, random_table
+from mbagent.types import Floats
+from tests.worlds import optimal_q, random_table
 
 GAMMA = 0.9
 

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from mbagent.planning.flat_monte_carlo import FlatMonteCarlo
-from mbagent.planning.machine_planner import MachinePlanner
-from mbagent.planning.mcts import MctsPlanner
 from mbagent.planning.planner import PlannerSettings
+from mbagent.planning.planners import MachinePlanner, MctsPlanner
 from tests.worlds import optimal_q, planner_for, prize_corridor, random_table
 
 ROLLOUTS = PlannerSettings(leaf_values="rollouts", backup="mean", num_simulations=4000, horizon=12, gamma=0.8, c_uct=0.7)

@@ -9,9 +9,9 @@ import pytest
 from gymnasium import spaces
 
 from mbagent import ModelLearningAgent
-from mbagent.models.graphs import DecisionGraphModel
-from mbagent.planning.mcts import MctsPlanner
+from mbagent.models.dbn import DecisionGraphModel
 from mbagent.planning.planner import PlannerSettings
+from mbagent.planning.planners import MctsPlanner
 from tests.models.helpers import dataset
 
 GAMMA = 0.95

@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
-from mbagent.models.state_graph import StateGraph
-from mbagent.planning import mcts
-from mbagent.planning.mcts import MctsPlanner
+from mbagent.models.mdp import StateGraph
+from mbagent.planning import planners
 from mbagent.planning.planner import PlannerSettings
-from mbagent.planning.reuse import carry_over
+from mbagent.planning.planners import MctsPlanner
+from mbagent.planning.search import carry_over
 from tests.worlds import TableWorld, arrival_goal, optimal_q, random_table
 
 KINDS = {
@@ -89,7 +89,7 @@ def test_new_goals_models_episodes_and_batches_drop_the_tree(kind: str) -> None:
 def test_a_tree_grown_too_large_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     made = planner(KINDS["machine"])
     made.plan(np.array([[0]]))
-    monkeypatch.setattr(mcts, "MAX_KEPT", 5)
+    monkeypatch.setattr(planners, "MAX_KEPT", 5)
     assert not carries_on(made, 0)
 
 

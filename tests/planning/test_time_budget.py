@@ -5,10 +5,10 @@ import time
 import numpy as np
 import pytest
 
-from mbagent.planning import mcts
+from mbagent.planning import planners
 from mbagent.planning.flat_monte_carlo import FlatMonteCarlo
-from mbagent.planning.mcts import MctsPlanner
 from mbagent.planning.planner import Planner, PlannerSettings
+from mbagent.planning.planners import MctsPlanner
 from tests.worlds import TableWorld, arrival_goal, random_table
 
 
@@ -53,7 +53,7 @@ def test_rollouts_go_by_the_clock_too(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_search_ends_where_it_holds_too_much(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mcts, "MAX_SEARCHED", 1)
+    monkeypatch.setattr(planners, "MAX_SEARCHED", 1)
     settings = PlannerSettings(max_states=1, lookahead_states=3, wave=4, time_budget=1e6)
     assert simulations(MctsPlanner(settings), 1, monkeypatch) == 4
 

@@ -3,13 +3,14 @@ import pytest
 
 from mbagent.analysis.planning_benchmark.crowds import IndependentModel
 from mbagent.models import SimulatorModel
-from mbagent.models.base import Actions, BaseTransitionModel, States, Successors
-from mbagent.models.reachable import ReachableMDP, grow_reachable
-from mbagent.models.state_graph import StateGraph
+from mbagent.models.base import BaseTransitionModel
+from mbagent.models.mdp import ReachableMDP, StateGraph, grow_reachable
+from mbagent.models.protocol import Successors
 from mbagent.planning.lookahead import grow_lookahead
-from mbagent.planning.machine_planner import MachinePlanner
 from mbagent.planning.planner import PlannerSettings
+from mbagent.planning.planners import MachinePlanner
 from mbagent.planning.value_iteration import MOST_SAMPLES, Machine, solve
+from mbagent.types import Actions, States
 from mbagent_envs.geyser_runner import GeyserRunner
 from tests.worlds import TableWorld, arrival_goal, optimal_q, random_table
 

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.transitions import TransitionBatch, TransitionDataset
+from mbagent.data import TransitionBatch, TransitionDataset
 
 Bits = NDArray[np.int64]
 

@@ -9,12 +9,12 @@ import numpy as np
 
 from mbagent.analysis.accuracy.data import Observations
 from mbagent.analysis.accuracy.measures import Distribution, counted, number
-from mbagent.models.base import TransitionModel
 from mbagent.models.boltzmann import BoltzmannConfig, ConditionalBoltzmannMachine
-from mbagent.models.config import NeuralConfig
-from mbagent.models.neural import NeuralTransitionModel
+from mbagent.models.neural.model import NeuralTransitionModel
+from mbagent.models.neural.network_pair import NeuralConfig
+from mbagent.models.neural.training import TrainingConfig
+from mbagent.models.protocol import TransitionModel
 from mbagent.models.tabular import TabularModel
-from mbagent.models.training import TrainingConfig
 from mbagent_envs.random_keys import derive
 
 T = TypeVar("T")

@@ -21,7 +21,7 @@ from mbagent.analysis.accuracy.measures import (
     union_correlation,
     valid_mass,
 )
-from mbagent.models.base import TransitionModel
+from mbagent.models.protocol import TransitionModel
 
 Draws = Literal["exact", "many", "c", "c systematic"]
 """How a distribution was found: exact probabilities, many independent draws, c independent or c systematic ones."""

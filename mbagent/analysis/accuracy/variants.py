@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mbagent.analysis.accuracy.data import Bits, Observations
 from mbagent.analysis.accuracy.measures import Distribution, counted, number
 from mbagent.analysis.accuracy.samplers import FitOptions, draw, fit_paper, paper_config
-from mbagent.models.neural import NeuralTransitionModel
+from mbagent.models.neural.model import NeuralTransitionModel
 
 Sampler: TypeAlias = Callable[[Observations, FitOptions, int, int], Distribution]
 """(data, options, number of draws for each input, seed) -> what was drawn."""

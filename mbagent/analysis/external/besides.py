@@ -11,9 +11,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.base import Actions, Bools, States, TransitionModel
-
-Ints = NDArray[np.int64]
+from mbagent.models.protocol import TransitionModel
+from mbagent.types import Actions, Bools, Ints, States
 
 FLICKER = 0.3
 """Probability that a bit changes in a step."""

@@ -18,8 +18,9 @@ from mbagent.analysis.external.besides import BesideWorld
 from mbagent.analysis.external.exact import Exact
 from mbagent.analysis.external.worlds import World, exact_world, true_model
 from mbagent.analysis.pages import FIGURE_STYLE, to_png
-from mbagent.models.base import Actions, States, Successors, TransitionModel
+from mbagent.models.protocol import Successors, TransitionModel
 from mbagent.spaces import FactoredSpace
+from mbagent.types import Actions, States
 
 Row = dict[str, Any]
 

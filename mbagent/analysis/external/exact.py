@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.analysis.external.rddl_truth import RddlTables
-from mbagent.models.base import Floats
+from mbagent.types import Floats
 
 
 @dataclass(frozen=True)

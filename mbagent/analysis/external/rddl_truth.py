@@ -11,9 +11,10 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mbagent.adapters.rddl import RddlEnv, load_rddl
-from mbagent.models.base import Actions, Bools, Floats, Randomness, States, Successors, as_keys
-from mbagent.models.known import KnownModel
-from mbagent.models.thinning import thin
+from mbagent.models.base import KnownModel
+from mbagent.models.protocol import Successors, as_keys
+from mbagent.models.systematic_sampling import thin
+from mbagent.types import Actions, Bools, Floats, Randomness, States
 from mbagent_envs.random_keys import uniforms
 
 MAX_STATES = 20_000

@@ -9,9 +9,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from mbagent.models.base import Actions, Bools, Floats, Randomness, States, Successors, as_keys
-from mbagent.models.known import KnownModel
+from mbagent.models.base import KnownModel
+from mbagent.models.protocol import Successors, as_keys
 from mbagent.spaces import ActionEnumeration, FactoredSpace
+from mbagent.types import Actions, Bools, Floats, Randomness, States
 
 DRAWS = 64
 """Steps of copies that tell what follows a (state, action)."""

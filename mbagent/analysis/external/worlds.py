@@ -22,8 +22,8 @@ from mbagent.analysis.external import made  # noqa: F401 - registers
 from mbagent.analysis.external.exact import Exact, exact_rddl, exact_toy_text
 from mbagent.analysis.external.rddl_truth import RddlModel, RddlTables, rddl_tables
 from mbagent.analysis.external.snapshots import SnapshotModel
-from mbagent.models.base import TransitionModel
-from mbagent.models.table import toy_text_model
+from mbagent.models.protocol import TransitionModel
+from mbagent.models.tabular import toy_text_model
 from mbagent.rewards import RewardFn
 
 RANDOM_EPISODES = 300

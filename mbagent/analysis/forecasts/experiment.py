@@ -16,11 +16,11 @@ from stable_baselines3.common.evaluation import evaluate_policy
 import mbagent
 from mbagent.analysis.folders import write_csv
 from mbagent.analysis.forecasts import measures as m
-from mbagent.models.base import Actions, Keys, States
-from mbagent.models.factory import build_direct
-from mbagent.models.forecasts import DirectForecastModel, iterate, longest_string, random_strings
+from mbagent.models.neural.forecasts import DirectForecastModel, iterate, longest_string, random_strings
+from mbagent.models.registry import build_direct
 from mbagent.models.simulator import SimulatorModel
 from mbagent.spaces import ActionEnumeration, FactoredSpace
+from mbagent.types import Actions, Keys, States
 from mbagent_envs.random_keys import derive
 
 Method = Literal["iterated", "direct", "true again"]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from mbagent.models.base import Actions, BaseTransitionModel, Floats, States, TransitionModel
-from mbagent.models.forecasts import DirectForecastModel, number_strings
+from mbagent.models.base import BaseTransitionModel
+from mbagent.models.neural.forecasts import DirectForecastModel, number_strings
+from mbagent.models.protocol import TransitionModel
+from mbagent.types import Actions, Floats, States
 
 NAN = float("nan")
 

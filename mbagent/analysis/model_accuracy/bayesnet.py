@@ -16,19 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.base import (
-    Actions,
-    BaseTransitionModel,
-    Bools,
-    FitReport,
-    Floats,
-    Randomness,
-    States,
-    as_keys,
-)
-from mbagent.models.factory import register_model
+from mbagent.data import TransitionDataset
+from mbagent.models.base import BaseTransitionModel, FitReport
+from mbagent.models.protocol import as_keys
+from mbagent.models.registry import register_model
 from mbagent.spaces import FactoredSpace
-from mbagent.transitions import TransitionDataset
+from mbagent.types import Actions, Bools, Floats, Randomness, States
 from mbagent_envs.random_keys import uniforms
 
 MOST_PARENTS = 8

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from mbagent.types import Floats
 from mbagent_envs import FlierCatcher, GeyserRunner, Maneuverer
-from mbagent_envs.game import Bits, Floats, Game, Scene
+from mbagent_envs.game import Bits, Game, Scene
 from mbagent_envs.random_keys import KeyArray
 
 

@@ -13,11 +13,12 @@ from gymnasium.spaces import MultiBinary
 
 from mbagent.analysis.model_accuracy import bayesnet
 from mbagent.analysis.model_accuracy.worlds import PushedBox, Switch, TwoPlayers
-from mbagent.models.base import Bools, Floats, States, TransitionModel
-from mbagent.models.factory import build_model
+from mbagent.data import TransitionBatch, TransitionDataset
+from mbagent.models.protocol import TransitionModel
+from mbagent.models.registry import build_model
 from mbagent.models.simulator import SimulatorModel
 from mbagent.spaces import FactoredSpace
-from mbagent.transitions import TransitionBatch, TransitionDataset
+from mbagent.types import Bools, Floats, States
 from mbagent_envs import FlierCatcher, Game, GeyserRunner, Maneuverer
 from mbagent_envs.random_keys import derive
 

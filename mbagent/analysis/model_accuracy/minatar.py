@@ -9,10 +9,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.factory import build_model
-from mbagent.models.trust import likeliest
+from mbagent.data import TransitionBatch, TransitionDataset
+from mbagent.models.model_error import likeliest
+from mbagent.models.registry import build_model
 from mbagent.spaces import FactoredSpace
-from mbagent.transitions import TransitionBatch, TransitionDataset
 from mbagent.wrappers import History
 
 Row: TypeAlias = dict[str, Any]

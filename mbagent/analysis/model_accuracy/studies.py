@@ -14,7 +14,6 @@ from typing import Any, TypeAlias
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import MultiBinary
-from numpy.typing import NDArray
 from scipy.stats import rankdata, spearmanr
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
@@ -25,18 +24,18 @@ from mbagent.analysis.cases import find_case, measure_scale
 from mbagent.analysis.model_accuracy.changed import CHANGES
 from mbagent.analysis.model_accuracy.experiment import CASES, LEARNING_RATE, certain_factors, random_play
 from mbagent.analysis.model_accuracy.minatar import minatar, variants
-from mbagent.models.base import Bools, Floats, TransitionModel
-from mbagent.models.factory import build_model
-from mbagent.models.graphs import DecisionGraphModel, LocalGraphModel
-from mbagent.models.graphs.parents import asked_columns, parent_factors
+from mbagent.data import TransitionBatch, TransitionDataset
+from mbagent.models.dbn import DecisionGraphModel, LocalGraphModel
+from mbagent.models.dbn.model import asked_columns, parent_factors
+from mbagent.models.model_error import estimate_error, likeliest, missed
+from mbagent.models.protocol import TransitionModel
+from mbagent.models.registry import build_model
 from mbagent.models.simulator import SimulatorModel
-from mbagent.models.trust import estimate_error, likeliest, missed
 from mbagent.spaces import FactoredSpace
-from mbagent.transitions import TransitionBatch, TransitionDataset
+from mbagent.types import Bools, Floats, Ints
 from mbagent_envs import Game, Maneuverer
 from mbagent_envs.random_keys import derive
 
-Ints: TypeAlias = NDArray[np.int64]
 Row: TypeAlias = dict[str, Any]
 NAN = float("nan")
 N_TESTS = 20_000

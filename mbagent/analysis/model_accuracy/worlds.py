@@ -11,7 +11,8 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from mbagent_envs.game import Bits, Bools, Floats, Game, Ints, Scene
+from mbagent.types import Bools, Floats, Ints
+from mbagent_envs.game import Bits, Game, Scene
 from mbagent_envs.random_keys import KeyArray, derive, uniforms
 
 ROWS, COLUMNS = np.array([-1, 0, 1, 0]), np.array([0, 1, 0, -1])

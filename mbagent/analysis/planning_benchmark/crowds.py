@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from mbagent.models.base import Actions, Bools, Floats, Randomness, States, Successors, as_keys
-from mbagent.models.known import KnownModel
-from mbagent.models.systematic import independent_successors
-from mbagent.planning.goal import Goal
-from mbagent.planning.mcts import MctsPlanner
+from mbagent.models.base import KnownModel
+from mbagent.models.neural.sampling import independent_successors
+from mbagent.models.protocol import Successors, as_keys
 from mbagent.planning.planner import PlannerSettings
+from mbagent.planning.planners import MctsPlanner
+from mbagent.types import Actions, Bools, Floats, Randomness, Reward, States
 from mbagent_envs.random_keys import derive, uniforms
 
 Row = dict[str, Any]
@@ -71,7 +71,7 @@ class World:
 
     name: str
     model: IndependentModel
-    goal: Goal
+    goal: Reward
     start: States
 
 

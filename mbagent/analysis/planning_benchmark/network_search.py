@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from mbagent.analysis.planning_benchmark.networks import AT_ONCE, BUDGETS, SEEDS, NetworkTask, PairwiseGoal, PeerOnNetworks
-from mbagent.analysis.planning_benchmark.worlds import Ints
 from mbagent.planning.graph_search import GraphSearch
 from mbagent.planning.planner import PlannerSettings
+from mbagent.types import Ints
 
 MCTX = "mctx, Gumbel MuZero"
 HORIZON, WAVE = 15, 256

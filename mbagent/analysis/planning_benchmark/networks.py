@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.analysis.planning_benchmark.peers import Speed, run_script
-from mbagent.analysis.planning_benchmark.worlds import Floats, Ints
-from mbagent.models.neural import NeuralTransitionModel
-from mbagent.models.packing import pack_dense, pack_groups
-from mbagent.transitions import TransitionBatch, TransitionDataset
+from mbagent.data import TransitionBatch, TransitionDataset
+from mbagent.models.neural.export import pack_dense, pack_groups
+from mbagent.models.neural.model import NeuralTransitionModel
+from mbagent.types import Floats, Ints
 from mbagent_envs.geyser_runner import GeyserRunner
 from mbagent_envs.random_keys import derive
 

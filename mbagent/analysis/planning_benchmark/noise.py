@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from mbagent.analysis.planning_benchmark.worlds import Ints
-from mbagent.models.config import NeuralConfig
-from mbagent.models.factory import build_model
-from mbagent.models.neural import NeuralTransitionModel
-from mbagent.models.training import Trainer, TrainingConfig, examples
+from mbagent.data import TransitionBatch, TransitionDataset
+from mbagent.models.neural.model import NeuralTransitionModel
+from mbagent.models.neural.network_pair import NeuralConfig
+from mbagent.models.neural.training import Trainer, TrainingConfig, examples
+from mbagent.models.registry import build_model
 from mbagent.spaces import FactoredSpace
-from mbagent.transitions import TransitionBatch, TransitionDataset
+from mbagent.types import Ints
 
 Sampler: TypeAlias = Literal["networks", "sweeps"]
 

@@ -10,11 +10,12 @@ from typing import Protocol, TypeAlias
 import numpy as np
 
 from mbagent.analysis.planning_benchmark.peers import Speed
-from mbagent.analysis.planning_benchmark.worlds import Ints, World
-from mbagent.models.table import TableModel
+from mbagent.analysis.planning_benchmark.worlds import World
+from mbagent.models.tabular import TableModel
 from mbagent.planning.machine_search import known_machine, search_machine
-from mbagent.planning.mcts import MctsPlanner
 from mbagent.planning.planner import PlannerSettings, best_actions
+from mbagent.planning.planners import MctsPlanner
+from mbagent.types import Ints
 
 
 class TableSearch(Protocol):

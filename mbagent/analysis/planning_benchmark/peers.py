@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from mbagent.analysis.planning_benchmark.worlds import Ints, World, save_world
+from mbagent.analysis.planning_benchmark.worlds import World, save_world
+from mbagent.types import Ints
 
 SCRIPTS = Path(__file__).parents[3] / "scripts" / "peers"
 """The scripts that run them, in the source tree."""

@@ -13,9 +13,9 @@ from mbagent.agent import ModelLearningAgent
 from mbagent.analysis.baselines import as_policy
 from mbagent.analysis.cases import Scale, find_case, finite_horizon_value, game_of, measure_scale, play
 from mbagent.analysis.statistics import interquartile_interval, normalised
-from mbagent.models.base import Floats
 from mbagent.models.simulator import SimulatorModel
-from mbagent.models.table import toy_text_model
+from mbagent.models.tabular import toy_text_model
+from mbagent.types import Floats
 
 Row = dict[str, Any]
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from mbagent.analysis.planning_benchmark.ours import OWN_SEARCHES, Prepare, time_search
 from mbagent.analysis.planning_benchmark.peers import PEERS, SPEEDS, PeerError, PeerResult, Speed, run_peer
-from mbagent.analysis.planning_benchmark.worlds import N_STATES, Ints, Kind, World, choose_roots, random_world, side_by_side
+from mbagent.analysis.planning_benchmark.worlds import N_STATES, Kind, World, choose_roots, random_world, side_by_side
+from mbagent.types import Ints
 
 
 @dataclass(frozen=True)

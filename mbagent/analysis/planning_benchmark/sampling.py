@@ -13,8 +13,8 @@ import torch
 from scipy import stats
 
 from mbagent.analysis.planning_benchmark.noise import random_inputs
-from mbagent.analysis.planning_benchmark.worlds import Floats, Ints
-from mbagent.models.neural import NeuralTransitionModel, PrunedAs
+from mbagent.models.neural.model import NeuralTransitionModel, PrunedAs
+from mbagent.types import Floats, Ints
 from mbagent_envs.random_keys import derive
 
 TRUSTED = 0.98

@@ -10,9 +10,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-Ints: TypeAlias = NDArray[np.int64]
-Floats: TypeAlias = NDArray[np.float64]
-Bools: TypeAlias = NDArray[np.bool_]
+from mbagent.types import Bools, Floats, Ints
+
 Kind: TypeAlias = Literal["dense", "sparse"]
 
 N_STATES, N_ACTIONS, N_SUCCESSORS = 25, 4, 3

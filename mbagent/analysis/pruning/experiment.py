@@ -11,12 +11,12 @@ import mbagent
 from mbagent.analysis.cases import Case, Scale, find_case, game_of, measure_scale, play
 from mbagent.analysis.pruning.measures import excess, marginal_error, measure_others, measure_speeds, unseen_play
 from mbagent.analysis.pruning.truth import agreement
-from mbagent.models.arithmetic import Floats
-from mbagent.models.config import NeuralConfig
-from mbagent.models.modules import Influence, dependent_groups, influence, modules
-from mbagent.models.neural import NeuralTransitionModel
-from mbagent.models.pruning import PruningConfig
+from mbagent.models.neural.connections import PruningConfig
+from mbagent.models.neural.influence import Influence, dependent_groups, influence, modules
+from mbagent.models.neural.model import NeuralTransitionModel
+from mbagent.models.neural.network_pair import NeuralConfig
 from mbagent.spaces import ActionEnumeration, FactoredSpace
+from mbagent.types import Floats
 
 Networks: TypeAlias = Literal["causal", "paper"]
 """The default networks, or the paper's own: both on flat variables."""

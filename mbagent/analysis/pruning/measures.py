@@ -11,8 +11,8 @@ from scipy import stats
 from mbagent.analysis.cases import Case, game_of
 from mbagent.analysis.planning_benchmark.noise import random_data, random_inputs, trained
 from mbagent.analysis.planning_benchmark.sampling import EVERYTHING, microseconds, using
-from mbagent.models.config import NeuralConfig
-from mbagent.models.neural import NeuralTransitionModel, PrunedAs
+from mbagent.models.neural.model import NeuralTransitionModel, PrunedAs
+from mbagent.models.neural.network_pair import NeuralConfig
 from mbagent.models.simulator import SimulatorModel
 from mbagent_envs.random_keys import derive
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mbagent.analysis.pages import FIGURE_STYLE, to_png
-from mbagent.models.modules import Influence, Module, dependent_groups, modules
+from mbagent.models.neural.influence import Influence, Module, dependent_groups, modules
 
 ALONE = "#eceff2"
 """Of a variable that no other leads to, nor it to any."""

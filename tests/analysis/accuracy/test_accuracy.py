@@ -25,8 +25,8 @@ from mbagent.analysis.accuracy.scores import Score, size
 from mbagent.analysis.accuracy.summary import cell, paper_parameters, statements
 from mbagent.analysis.accuracy.trials import find_trial
 from mbagent.models.boltzmann import BoltzmannConfig
-from mbagent.models.config import NeuralConfig
-from mbagent.models.training import TrainingConfig
+from mbagent.models.neural.network_pair import NeuralConfig
+from mbagent.models.neural.training import TrainingConfig
 from scripts.sampling_accuracy import main
 
 DATA = generate(DataOptions(3, 4), 0)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mbagent.analysis.external.besides import BESIDES, BesideWorld, chain, grid, key_and_door
+from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.models import TabularModel
-from mbagent.transitions import TransitionBatch, TransitionDataset
 from scripts.exploration import main
 
 

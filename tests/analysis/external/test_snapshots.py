@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mbagent.analysis.external.snapshots import DRAWS, SnapshotModel
-from mbagent.models.table import toy_text_model
+from mbagent.models.tabular import toy_text_model
 
 
 def test_outcomes_are_those_of_the_rules() -> None:

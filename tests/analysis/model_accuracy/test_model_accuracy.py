@@ -5,13 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mbagent.analysis.model_accuracy.experiment import (
-    CASES,
-    certain_factors,
-    joint_variation,
-    likeliest_states,
-    random_play,
-)
+from mbagent.analysis.model_accuracy.experiment import CASES, certain_factors, joint_variation, likeliest_states, random_play
 from mbagent.analysis.model_accuracy.worlds import BoardWorld, PushedBox, Switch, TwoPlayers
 from mbagent.models import SimulatorModel
 from mbagent_envs import GeyserRunner, Maneuverer

@@ -15,7 +15,7 @@ from mbagent.analysis.planning_benchmark.networks import (
     random_play,
 )
 from mbagent.analysis.planning_benchmark.noise import build_sampler
-from mbagent.models.neural import NeuralTransitionModel
+from mbagent.models.neural.model import NeuralTransitionModel
 from mbagent_envs.geyser_runner import GeyserRunner
 
 HALF = WIDTH // 2

@@ -8,7 +8,8 @@ from mbagent.analysis.planning_benchmark.ours import OWN_SEARCHES, TableSearch, 
 from mbagent.analysis.planning_benchmark.page import write_page
 from mbagent.analysis.planning_benchmark.peers import PeerError, run_peer
 from mbagent.analysis.planning_benchmark.regret import Settings, build_arena, compare, score
-from mbagent.analysis.planning_benchmark.worlds import Floats, Ints, Kind, World, choose_roots, random_world, side_by_side
+from mbagent.analysis.planning_benchmark.worlds import Kind, World, choose_roots, random_world, side_by_side
+from mbagent.types import Floats, Ints
 from tests.worlds import optimal_q
 
 

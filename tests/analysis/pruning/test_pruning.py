@@ -13,10 +13,10 @@ from mbagent.analysis.pruning.page import exponent, markdown_table, summary, sum
 from mbagent.analysis.pruning.picture import draw_modules
 from mbagent.analysis.pruning.truth import agreement, flier_catcher_dependencies
 from mbagent.analysis.statistics import mean_interval
-from mbagent.models.modules import Influence
+from mbagent.models.neural.influence import Influence
 from mbagent_envs import FlierCatcher
 from scripts.pruning import main
-from tests.models.test_pruning import N_BITS, fitted, shifted
+from tests.models.neural.test_connections import N_BITS, fitted, shifted
 
 
 def perfect(game: FlierCatcher) -> Influence:

@@ -1,0 +1,244 @@
+"""How environments become the VecEnv that the agent steps, in this process or in processes of their own.
+
+Observations keep the environment's own layout. A worker process of SB3's SubprocVecEnv ends with its first error, be it a missing
+attribute or one that cannot be pickled, so workers are asked only for what is known to exist.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from copy import deepcopy
+from multiprocessing.reduction import ForkingPickler
+from typing import Any
+
+import gymnasium as gym
+from gymnasium import spaces
+from stable_baselines3.common.env_util import is_wrapped
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env.patch_gym import _patch_env
+
+from mbagent.spaces import ActionEnumeration, FactoredSpace, OutsideSpaceError, one_as_batch
+
+
+def wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+    """As SB3 wraps environments, but without moving the channels of image-like observations.
+
+    Raises:
+        TypeError: it is no environment that SB3 takes; or the observation space is nested deeper than SB3's vector
+            environments can carry, see wrappers.Flat.
+        ValueError: it normalizes observations.
+    """
+    if not isinstance(env, VecEnv):
+        _refuse_others(env)
+        env = _patch_env(env)
+        FactoredSpace(env.observation_space)  # refuses in one sentence what SB3's wrapper would stumble over
+        ActionEnumeration(env.action_space)
+        _refuse_nested(env.observation_space)
+        env = Guarded(env)
+        if monitor_wrapper and not is_wrapped(env, Monitor):
+            env = Monitor(env)
+        if verbose >= 1:
+            print("Wrapping the env in a Monitor and a DummyVecEnv.")  # noqa: T201 - as SB3 does
+        single = env
+        env = DummyVecEnv([lambda: single])
+    normalized = unwrap_vec_normalize(env)
+    if normalized is not None and normalized.norm_obs:
+        raise ValueError(
+            "VecNormalize makes the observations continuous, but this agent models discrete ones; turn that off: "
+            "VecNormalize(env, norm_obs=False)."
+        )
+    return env
+
+
+class Guarded(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
+    """An environment whose results are checked, and copied, so that it may use its arrays and dicts again.
+
+    SB3 keeps the last observation of an episode while the environment is reset; without a copy, a reset that clears the
+    environment's own array would turn it into the first of the next.
+
+    Args:
+        env: an environment with discrete spaces (see FactoredSpace).
+    """
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        """See the class."""
+        gym.utils.RecordConstructorArgs.__init__(self)
+        gym.Wrapper.__init__(self, env)
+        self._space = FactoredSpace(env.observation_space)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """See gymnasium.Env.
+
+        Raises:
+            TypeError, ValueError: the environment returned something else than it should.
+        """
+        obs, info = self._parts(self.env.reset(seed=seed, options=options), "reset", "(observation, info)", 2)
+        return self._own(obs), self._copied(info)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """As ``reset``."""
+        names = "(observation, reward, terminated, truncated, info)"
+        obs, reward, terminated, truncated, info = self._parts(self.env.step(action), "step", names, 5)
+        try:
+            float(reward)
+        except (TypeError, ValueError) as error:
+            raise TypeError(
+                f"The environment's step returned the reward {reward!r} instead of one number; fix the environment."
+            ) from error
+        return self._own(obs), reward, terminated, truncated, self._copied(info)
+
+    @staticmethod
+    def _parts(returned: Any, method: str, names: str, n: int) -> tuple[Any, ...]:
+        if isinstance(returned, tuple) and len(returned) == n:
+            return returned
+        got = f"{len(returned)} values" if isinstance(returned, tuple) else repr(returned)
+        raise TypeError(f"The environment's {method} returned {got} instead of Gymnasium's {names}; fix the environment.")
+
+    def _own(self, obs: Any) -> Any:
+        space = self._space.space
+        if isinstance(obs, list) or not space.contains(obs):  # the space's own check is quick, but refuses other data types
+            with blaming_environment():
+                self._space.encode(one_as_batch(space, obs))
+        return deepcopy(obs)
+
+    @staticmethod
+    def _copied(info: Any) -> dict[str, Any]:
+        if isinstance(info, dict):
+            return dict(info)
+        raise TypeError(f"The environment returned the info {info!r} instead of a dict; fix the environment.")
+
+
+@contextmanager
+def blaming_environment() -> Iterator[None]:
+    """Observations that do not fit their space are the environment's mistake here, and errors say so.
+
+    Raises:
+        ValueError: one did not fit.
+    """
+    try:
+        yield
+    except OutsideSpaceError as error:
+        raise ValueError(
+            f"The environment violates its own observation_space: {error.cause[0].lower()}{error.cause[1:]}; "
+            "fix that space, or what reset and step return."
+        ) from error
+
+
+def _refuse_others(env: Any) -> None:
+    if isinstance(env, gym.vector.VectorEnv):
+        raise TypeError(
+            f"env is a vector environment of Gymnasium ({type(env).__name__}), but SB3's algorithms take only SB3's; create it "
+            "with stable_baselines3.common.env_util.make_vec_env(id, n_envs=...) instead of gym.make_vec."
+        )
+    if isinstance(env, type) or not callable(getattr(env, "step", None)):
+        raise TypeError(f"env must be a Gymnasium environment, a VecEnv of SB3 or a registered id, got {env!r}.")
+
+
+def _refuse_nested(space: spaces.Space[object]) -> None:
+    if not isinstance(space, spaces.Dict | spaces.Tuple):
+        return
+    parts = space.spaces.values() if isinstance(space, spaces.Dict) else space.spaces
+    if any(isinstance(part, spaces.Dict | spaces.Tuple) for part in parts):
+        raise TypeError(
+            "The observation space is nested (a Dict or Tuple inside another), which SB3's vector environments cannot carry; "
+            "wrap the environment: mbagent.wrappers.Flat(env)."
+        )
+
+
+ENDED = (
+    "A process of the SubprocVecEnv has ended or was interrupted in a step, so its environments cannot be used any more (an "
+    "error that an environment raised is printed above). The agent keeps the steps recorded so far: learn(0) fits it to them, "
+    "and set_env(env) gives it a new environment."
+)
+
+LOOK_EVERY = 1.0
+"""Seconds without an answer after which it is checked whether the process still runs."""
+
+
+@contextmanager
+def naming_ended_processes(env: VecEnv) -> Iterator[None]:
+    """Says in a sentence what the error of a broken pipe means; errors of environments in this process pass unchanged.
+
+    Raises:
+        RuntimeError: a process of ``env`` has ended; the cause is the error of its pipe.
+    """
+    try:
+        yield
+    except (EOFError, ConnectionError) as error:
+        if not isinstance(env.unwrapped, SubprocVecEnv):
+            raise
+        raise RuntimeError(ENDED) from error
+
+
+def has_ended(env: VecEnv) -> bool:
+    """Whether the environments are in processes of their own of which one has ended, or owes an answer that nobody waits for."""
+    inner = env.unwrapped
+    try:
+        return isinstance(inner, SubprocVecEnv) and any(remote.poll() for remote in inner.remotes)
+    except OSError:  # the pipe is broken or closed
+        return True
+
+
+def step(env: VecEnv, actions: Any) -> tuple[Any, Any, Any, Any]:
+    """As ``env.step``, for environments of which a process may end.
+
+    Raises:
+        RuntimeError: a process has ended.
+    """
+    inner = env.unwrapped
+    if not isinstance(inner, SubprocVecEnv):
+        return env.step(actions)
+    with naming_ended_processes(env):
+        env.step_async(actions)
+        # Forked processes hold each other's pipes open, so that reading from one that has ended could wait for ever.
+        for remote, process in zip(inner.remotes, inner.processes, strict=True):
+            while not remote.poll(LOOK_EVERY):
+                if not process.is_alive():
+                    raise EOFError(f"The process {process.name} has ended without an answer.")
+        return env.step_wait()
+
+
+def own_reward(env: VecEnv) -> tuple[Any, str]:
+    """The ``reward_fn`` of the first environment or None, and what to say where it is None."""
+    missing = "The environment has no reward_fn"
+    alone = not isinstance(env.unwrapped, SubprocVecEnv)
+    try:
+        if not alone and not env.env_method("has_wrapper_attr", "reward_fn", indices=0)[0]:
+            return None, missing
+        if alone or env.env_method("has_wrapper_attr", _IfPicklable("reward_fn"), indices=0)[0]:
+            return env.get_attr("reward_fn", indices=0)[0], missing
+    except Exception as error:  # it has none, cannot be unpickled here, or the process has ended, which ``learn`` will tell
+        if alone and isinstance(error, AttributeError):
+            return None, missing
+        if alone:  # an error of its own
+            return None, f"The environment's reward_fn cannot be read ({type(error).__name__}: {error})"
+    return None, (
+        "The environment's reward_fn cannot be pickled, as it must be to leave the environment's process (to plan with it, give "
+        "the agent the function: reward=fn)"
+    )
+
+
+class _IfPicklable:
+    """The name of an attribute; the environment's process receives an empty one if the attribute's value cannot be pickled."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _if_picklable, (self._name,)
+
+
+def _if_picklable(name: str) -> str:
+    # SB3's worker has no command that would tell. It unpickles a command's arguments in the function whose ``env`` is asked for.
+    frame = sys._getframe()
+    while frame.f_back is not None and not isinstance(frame.f_locals.get("env"), gym.Env):
+        frame = frame.f_back
+    try:
+        ForkingPickler.dumps(frame.f_locals["env"].get_wrapper_attr(name))
+    except Exception:
+        return ""
+    return name

@@ -1,0 +1,377 @@
+"""Decision graphs as few flat arrays, and which units a state touches: what planning with them need not look at.
+
+In a state where everything is 0, each unit has a *usual* distribution for each action; mostly it stays as it is. In another
+state only those units can differ that usually ask for a column in which the states differ, or that differ themselves. With few
+things on a board these are few, whatever its size.
+Shapes: A actions, U units, F factors, R values of all factors, W words of 64 units, M meetings, Q couplings.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.dbn.arrays import Graphs, distributions, meets, n_columns, show, with_rest, without_noise
+from mbagent.models.dbn.features import Acts, Layout
+from mbagent.models.dbn.sampling import only_possible
+from mbagent.models.systematic_sampling import (
+    NEGLIGIBLE,
+)
+from mbagent.types import Bools, Floats, Ints, Words
+from mbagent_envs.jit import compiled, inlined
+
+MOST_WORDS = 4_000_000
+"""Words of a table for each action; where they would be more, one table serves all actions."""
+
+FIRST, MEMBERS, OUTPUTS, START, PAIR, COUPLING = range(6)
+"""Columns of ``Lean.units``."""
+
+
+class Lean(NamedTuple):
+    """Graphs as few arrays, and what each value of each factor touches.
+
+    Attributes:
+        units: where its factors begin, how many there are, number of values, where its distribution and its pairs begin, and
+            its coupling or -1, int64 [U, 6].
+        members: factors of the units, int64.
+        entries: where the entries of each pair begin, int64 [pairs + 1]; see ``compiled.Graphs``.
+        entry: value and first node, int64 [E, 2].
+        node: column, and the next node where it is off and on, int32 [nodes, 3].
+        leaf: rate and spread, [nodes, 2].
+        habit: of each pair, how often it stays and how probable novelties are, [pairs, 2].
+        base: where novelties are drawn from, [sum of cardinalities].
+        still: probability that a unit without graphs changes, [1].
+        noise: see ``compiled.Graphs``.
+        exactly: of the couplings, bool [Q].
+        row: where each factor's values begin among the rows, int64 [F + 1].
+        shown: where each factor's columns begin, int64 [F + 1].
+        columns: the lowest and highest value for which each is on, int64 [D, 2].
+        cells, meetings, counts, met, weights: see ``units.Layout``.
+        touched: units that a factor's value touches, as bits, uint64 [A or 1, R, W].
+        by_meeting: the same of meetings, uint64 [A or 1, M, W].
+        always: units that do something even where everything is 0, uint64 [A, W].
+        usual_on: columns that are on where everything is 0 and no action is taken, bool [D].
+        acts, factor, next_meetings: see ``units.Layout``.
+        end_first, end_node, end_rate: graph of the end where it is drawn late, else empty, see ``ending.end_graph``.
+    """
+
+    units: Ints
+    members: Ints
+    entries: Ints
+    entry: Ints
+    node: NDArray[np.int32]
+    leaf: Floats
+    habit: Floats
+    base: Floats
+    still: Floats
+    noise: Floats
+    exactly: Bools
+    row: Ints
+    shown: Ints
+    columns: Ints
+    cells: Ints
+    meetings: Ints
+    counts: Ints
+    met: Bools
+    weights: Ints
+    touched: Words
+    by_meeting: Words
+    always: Words
+    usual_on: Bools
+    acts: Acts
+    factor: Ints
+    next_meetings: Ints
+    end_first: Ints
+    end_node: NDArray[np.int32]
+    end_rate: Floats
+
+
+def lean(layout: Layout, graphs: Graphs, late: Graphs, cardinalities: tuple[int, ...]) -> Lean:
+    """The arrays of some graphs.
+
+    Args:
+        layout: the units.
+        graphs: of all of them, for planning.
+        late: of none, or of the end alone.
+        cardinalities: number of values of each factor, length F.
+    """
+    row = np.concatenate([[0], np.cumsum(cardinalities)]).astype(np.int64)
+    shown = np.searchsorted(layout.factor, np.arange(layout.n_factors + 1)).astype(np.int64)
+    always, touched, by_meeting, on = _tables(layout, graphs, row)
+    sizes = np.diff(layout.first)
+    units = np.stack([layout.first[:-1], sizes, layout.outputs, graphs.start[:-1], graphs.pairs[:-1], layout.coupling_of], axis=1)
+    end_first, end_node, end_rate = end_graph(layout, late)
+    return Lean(
+        units=np.ascontiguousarray(units, dtype=np.int64),
+        members=layout.members,
+        entries=graphs.entries,
+        entry=np.stack([graphs.values, graphs.nodes], axis=1),
+        node=np.stack([graphs.column, graphs.off, graphs.on], axis=1).astype(np.int32),
+        leaf=np.stack([graphs.rate, graphs.spread], axis=1),
+        habit=np.stack([graphs.stays, graphs.novelty], axis=1),
+        base=graphs.base,
+        still=graphs.still,
+        noise=graphs.noise,
+        exactly=layout.exactly,
+        row=row,
+        shown=shown,
+        columns=np.stack([layout.value, layout.top], axis=1),
+        cells=layout.cells,
+        meetings=layout.meetings,
+        counts=layout.counts,
+        met=layout.met,
+        weights=layout.weights,
+        touched=touched,
+        by_meeting=by_meeting,
+        always=always,
+        usual_on=on,
+        acts=layout.acts,
+        factor=layout.factor,
+        next_meetings=layout.next_meetings,
+        end_first=end_first,
+        end_node=end_node,
+        end_rate=end_rate,
+    )
+
+
+def _tables(layout: Layout, graphs: Graphs, row: Ints) -> tuple[Words, Words, Words, Bools]:
+    """``always``, ``touched``, ``by_meeting`` and ``usual_on`` of Lean."""
+    n_words, n_rows, n_actions = -(-len(layout.outputs) // 64), int(row[-1]), len(layout.acts.way)
+    n_tables = n_actions if n_actions * n_rows * n_words <= MOST_WORDS else 1
+    touched = np.zeros((n_tables, n_rows, n_words), dtype=np.uint64)
+    by_meeting = np.zeros((n_tables, len(layout.meetings), n_words), dtype=np.uint64)
+    nothing, on = np.zeros(layout.n_factors, dtype=np.int64), np.zeros(n_columns(layout), dtype=np.bool_)
+    always = np.zeros((n_actions, n_words), dtype=np.uint64)
+    _usual(layout, graphs, nothing, on, always)
+    _dependents(layout, graphs, row, nothing, on, touched, by_meeting)
+    show(nothing, 0, layout, on)
+    on[len(layout.factor) : len(layout.factor) + layout.acts.n_columns] = False
+    return always, touched, by_meeting, on
+
+
+@compiled
+def set_bit(words: Words, unit: int) -> None:
+    """Adds a unit to a set [W]."""
+    words[unit >> 6] |= np.uint64(1) << np.uint64(unit & 63)
+
+
+@compiled
+def _usual(layout: Layout, graphs: Graphs, nothing: Ints, on: Bools, always: Words) -> None:
+    """Fills ``always``; see Lean."""
+    values, rates = np.zeros(len(layout.outputs), dtype=np.int64), np.zeros(graphs.start[-1], dtype=np.float64)
+    everything = np.arange(len(layout.outputs))
+    for action in range(len(layout.acts.way)):
+        show(nothing, action, layout, on)
+        distributions(everything, nothing, action, layout, graphs, on, values, rates)
+        for unit in graphs.changing:
+            start = graphs.start[unit]
+            if layout.coupling_of[unit] >= 0:
+                active = rates[start + 1] > 0.0
+            else:
+                active = only_possible(rates, start, layout.outputs[unit]) != 0
+            if active:
+                set_bit(always[action], unit)
+
+
+@compiled
+def _dependents(layout: Layout, graphs: Graphs, row: Ints, nothing: Ints, on: Bools, touched: Words, by_meeting: Words) -> None:
+    """Fills the last two arguments; see Lean.
+
+    Where everything is 0, a unit's graphs are followed to their usual leaves; as long as the columns asked on these ways are as
+    usual, nothing else can be found. So only these touch the unit.
+    """
+    first_action, first_meeting = len(layout.factor), len(layout.factor) + layout.acts.n_columns
+    for unit in range(len(layout.outputs) - 2):
+        if layout.coupling_of[unit] >= 0 or (graphs.changing == unit).any():
+            for factor in layout.members[layout.first[unit] : layout.first[unit + 1]]:
+                for r in range(row[factor] + 1, row[factor + 1]):
+                    for table in range(len(touched)):
+                        set_bit(touched[table, r], unit)
+    for action in range(len(layout.acts.way)):
+        table = action if len(touched) > 1 else 0
+        show(nothing, action, layout, on)
+        for unit in graphs.changing:
+            pair = graphs.pairs[unit] + layout.acts.way[action] * layout.outputs[unit]
+            for entry in range(graphs.entries[pair], graphs.entries[pair + 1]):
+                node = graphs.nodes[entry]
+                while graphs.column[node] >= 0:
+                    column = graphs.column[node]
+                    if column >= first_meeting:
+                        set_bit(by_meeting[table, column - first_meeting], unit)
+                    elif column < first_action:
+                        _touch(column, unit, layout, row, touched[table])
+                    node = graphs.on[node] if on[column] else graphs.off[node]
+
+
+@compiled
+def _touch(column: int, unit: int, layout: Layout, row: Ints, touched: Words) -> None:
+    """Adds a unit to what those values of a column's factor touch that show the column otherwise than 0 does."""
+    factor, usual = layout.factor[column], layout.value[column] <= 0 <= layout.top[column]
+    for r in range(row[factor] + 1, row[factor + 1]):
+        value = r - row[factor]
+        if (layout.value[column] <= value <= layout.top[column]) != usual:
+            set_bit(touched[r], unit)
+
+
+@inlined
+def show_state(state: Ints, shown: Ints, columns: Ints, different: Ints, on: Bools) -> int:
+    """Writes factors that are not 0 to ``different`` and shows their columns; returns how many."""
+    n = 0
+    for factor in range(len(state)):
+        value = state[factor]
+        if value != 0:
+            different[n] = factor
+            n += 1
+            for column in range(shown[factor], shown[factor + 1]):
+                on[column] = columns[column, 0] <= value <= columns[column, 1]
+    return n
+
+
+@inlined
+def touched_units(
+    action: int,
+    state: Ints,
+    different: Ints,
+    row: Ints,
+    touched: Words,
+    by_meeting: Words,
+    always: Words,
+    first_meeting: int,
+    on: Bools,
+    usual: Bools,
+    words: Words,
+    units: Ints,
+) -> int:
+    """Writes the units that do anything unusual to ``units``, ascending; returns how many there are."""
+    table, n_words, n = action if len(touched) > 1 else 0, len(words), 0
+    for j in range(n_words):
+        words[j] = always[action, j]
+    for factor in different:
+        for j in range(n_words):
+            words[j] |= touched[table, row[factor] + state[factor], j]
+    for m in range(by_meeting.shape[1]):
+        if on[first_meeting + m] != usual[first_meeting + m]:
+            for j in range(n_words):
+                words[j] |= by_meeting[table, m, j]
+    for j in range(n_words):
+        word, unit = words[j], j << 6
+        while word:
+            while not word & np.uint64(0xFF):
+                word >>= np.uint64(8)
+                unit += 8
+            if word & np.uint64(1):
+                units[n] = unit
+                n += 1
+            word >>= np.uint64(1)
+            unit += 1
+    return n
+
+
+@inlined
+def value_of(unit: int, state: Ints, units: Ints, members: Ints) -> int:
+    """A unit's present value."""
+    first, n = units[unit, FIRST], units[unit, MEMBERS]
+    if n == 1:
+        return int(state[members[first]])
+    for member in range(n):
+        if state[members[first + member]] == 1:
+            return int(member)
+    return 0
+
+
+@inlined
+def rates_of(
+    touched: Ints,
+    state: Ints,
+    way: int,
+    on: Bools,
+    units: Ints,
+    members: Ints,
+    entries: Ints,
+    entry: Ints,
+    nodes: NDArray[np.int32],
+    leaf: Floats,
+    habit: Floats,
+    base: Floats,
+    still: Floats,
+    noise: float,
+    values: Ints,
+    out: Floats,
+) -> None:
+    """As ``compiled.distributions``, of the touched units; writes their present values to ``values``, in their order."""
+    for i in range(len(touched)):
+        unit = touched[i]
+        n, start, value = units[unit, OUTPUTS], units[unit, START], value_of(unit, state, units, members)
+        values[i] = value
+        pair = units[unit, PAIR] + way * n + value
+        begins, ends = entries[pair], entries[pair + 1]
+        total, slack, asked = 0.0, 0.0, False
+        for k in range(start, start + n):
+            out[k] = 0.0
+        for e in range(begins, ends):
+            node = entry[e, 1]
+            asked |= nodes[node, 0] >= 0
+            while nodes[node, 0] >= 0:  # without a branch, which a processor could not foresee
+                node = nodes[node, 1 + np.int64(on[nodes[node, 0]])]
+            rate = without_noise(leaf[node, 0], leaf[node, 1], n, noise)
+            out[start + entry[e, 0]] = rate
+            total += abs(rate)
+            slack += 3.0 * leaf[node, 1]
+        if n == 2:
+            usual = still[0] if still[0] >= noise else 0.0
+            rate = out[start + 1] if ends > begins else usual if value == 0 else 1.0 - usual
+            out[start], out[start + 1] = 1.0 - rate, rate
+            continue
+        with_rest(out, base, start, n, value, total, slack, habit[pair, 0], habit[pair, 1], ends > begins, asked, noise)
+
+
+def ends_late_only(layout: Layout, late: Graphs) -> bool:
+    """Whether nothing is drawn late but the end."""
+    return bool((late.changing == len(layout.outputs) - 2).all())
+
+
+def end_graph(layout: Layout, late: Graphs) -> tuple[Ints, NDArray[np.int32], Floats]:
+    """The graph of the end: first node of each way, -1 where it never came, [W]; nodes (column, off, on) and their rates.
+
+    Nothing where the end is not drawn late.
+    """
+    if len(late.changing) == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 3), dtype=np.int32), np.zeros(0)
+    first = np.full(layout.acts.n_ways, -1, dtype=np.int64)
+    for way in range(layout.acts.n_ways):
+        pair = late.pairs[len(layout.outputs) - 2] + 2 * way
+        if late.entries[pair + 1] > late.entries[pair]:
+            first[way] = late.nodes[late.entries[pair]]
+    rates = [without_noise(rate, spread, 2, NEGLIGIBLE) for rate, spread in zip(late.rate, late.spread, strict=True)]
+    return first, np.stack([late.column, late.off, late.on], axis=1).astype(np.int32), np.asarray(rates, dtype=np.float64)
+
+
+@inlined
+def end_rate(
+    node: int,
+    nodes: NDArray[np.int32],
+    rate: Floats,
+    otherwise: float,
+    following: Ints,
+    on: Bools,
+    factor: Ints,
+    columns: Ints,
+    cells: Ints,
+    next_meetings: Ints,
+) -> float:
+    """Probability that the episode ends with this next state [F]; ``on`` are the columns of the state before, [D]."""
+    if node < 0:
+        return otherwise
+    while nodes[node, 0] >= 0:
+        column = nodes[node, 0]
+        if column < len(on):
+            asked = on[column]
+        elif column < len(on) + len(factor):
+            c = column - len(on)
+            asked = columns[c, 0] <= following[factor[c]] <= columns[c, 1]
+        else:
+            asked = meets(following, cells, next_meetings[column - len(on) - len(factor)])
+        node = nodes[node, 2] if asked else nodes[node, 1]
+    return float(rate[node])

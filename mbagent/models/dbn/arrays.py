@@ -1,0 +1,318 @@
+"""Decision graphs as flat arrays: nodes ask for a column, contexts with equal rates share a leaf.
+
+After Chickering, Heckerman and Meek 1997, "A Bayesian approach to learning Bayesian networks with local structure".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from mbagent.models.dbn.effects import chained
+from mbagent.models.dbn.features import BEYOND, Layout, Question
+from mbagent.models.dbn.leaf_prior import LeafPrior, fitted_prior
+from mbagent.models.dbn.smoothing import Habit
+from mbagent.models.dbn.splits import Search
+from mbagent.types import Bools, Floats, Ints
+from mbagent_envs.jit import compiled, inlined
+
+
+class Graphs(NamedTuple):
+    """The graphs of all units.
+
+    Attributes:
+        changing: units that have graphs, int64.
+        pairs: where the pairs (way, value) of each unit begin, int64 [U + 1]; pair ``way * cardinality + value``, with the
+            action's way, see ``acts.Acts``.
+        entries: where the entries of each pair begin, int64 [pairs + 1].
+        values: the value that an entry is about, int64 [E].
+        nodes: its first node, int64 [E].
+        column: what a node asks for, -1 at a leaf, int64 [nodes].
+        off, on: next node, int64 [nodes].
+        rate: probability at a leaf, [nodes].
+        spread: standard error of a leaf's rate, 0 where all its rows agree, [nodes].
+        stays: share of a pair's rows in which the unit kept its value, [pairs]; 1 where there are none.
+        novelty: probability that what follows a pair is none of what was seen to follow it, [pairs].
+        base: where the novelties of each unit are drawn from, after ``start`` [U + 1], [sum of cardinalities].
+        still: probability that a unit without graphs changes, [1].
+        noise: 0, or for planning: values no observation stands behind count as impossible where they are less probable than
+            this share of the likeliest, [1].
+    """
+
+    changing: Ints
+    pairs: Ints
+    entries: Ints
+    values: Ints
+    nodes: Ints
+    column: Ints
+    off: Ints
+    on: Ints
+    rate: Floats
+    spread: Floats
+    stays: Floats
+    novelty: Floats
+    start: Ints
+    base: Floats
+    still: Floats
+    noise: Floats
+
+
+class Nodes:
+    """Nodes of all graphs while they are built."""
+
+    def __init__(self) -> None:
+        self.links: list[tuple[int, int, int]] = []
+        self.rates: list[tuple[float, float]] = []
+
+    def add(self, column: int, off: int, on: int, rate: float = 0.0, spread: float = 0.0) -> int:
+        """Adds a node; returns its number."""
+        self.links.append((column, off, on))
+        self.rates.append((rate, spread))
+        return len(self.links) - 1
+
+    def graph(self, search: Search, prior: LeafPrior) -> Ints:
+        """Adds a head's graph; returns the first node of each of its first contexts."""
+        n, e = search.counts()
+        rates = prior.rates(n, e, search.typical)
+        spreads = np.sqrt(e * (n - e) / np.maximum(n, 1) ** 3)
+        level = [self.add(-1, 0, 0, float(rate), float(spread)) for rate, spread in zip(rates, spreads, strict=True)]
+        for split in reversed(search.splits):
+            level = [
+                level[off] if level[off] == level[on] else self.add(split.column, level[off], level[on])
+                for off, on in zip(split.off, split.on, strict=True)
+            ]
+        return np.asarray(level, dtype=np.int64)
+
+
+def linked(
+    entries: Ints | Sequence[tuple[int, int, int]], n_pairs: int, links: Sequence[tuple[int, int, int]]
+) -> tuple[Ints, Ints, Ints, Ints, Ints, Ints]:
+    """The arrays from ``entries`` to ``on`` of Graphs, from entries (pair, value, node) and nodes (column, off, on)."""
+    table = np.asarray(entries, dtype=np.int64).reshape(-1, 3)
+    table = table[np.lexsort(table.T[::-1])]
+    parts = np.asarray(links, dtype=np.int64).reshape(-1, 3)
+    begins = np.searchsorted(table[:, 0], np.arange(n_pairs + 1)).astype(np.int64)
+    value, node = np.ascontiguousarray(table[:, 1:].T)
+    column, off, on = np.ascontiguousarray(parts.T)
+    return begins, value, node, column, off, on
+
+
+def build(layout: Layout, asked: Sequence[Question], found: Sequence[Search], habits: Sequence[Habit], still: float) -> Graphs:
+    """All graphs.
+
+    Args:
+        layout: the units.
+        asked: the questions.
+        found: what was found for each.
+        habits: of each unit.
+        still: probability that a unit without graphs changes.
+    """
+    nodes, prior = Nodes(), fitted_prior(found)
+    pairs = np.concatenate([[0], np.cumsum(layout.acts.n_ways * layout.outputs)]).astype(np.int64)
+    entries = [np.zeros((0, 3), dtype=np.int64)]
+    partnered: dict[int, list[tuple[Question, Ints]]] = {}
+    for question, search in zip(asked, found, strict=True):
+        first = nodes.graph(search, prior)[question.context]
+        if question.partner is not None:
+            partnered.setdefault(question.unit, []).append((question, first))
+        else:
+            entries.append(np.stack([pairs[question.unit] + question.pairs, question.values, first], axis=1))
+    for unit, answered in partnered.items():
+        entries += _by_partner(nodes, answered, pairs[unit], int(layout.outputs[unit]), layout.acts.n_ways)
+    rates = np.asarray(nodes.rates, dtype=np.float64).reshape(-1, 2)
+    return Graphs(
+        np.asarray(sorted({question.unit for question in asked}), dtype=np.int64),
+        pairs,
+        *linked(np.concatenate(entries), int(pairs[-1]), nodes.links),
+        np.ascontiguousarray(rates[:, 0]),
+        np.ascontiguousarray(rates[:, 1]),
+        np.concatenate([habit.stays for habit in habits]),
+        np.concatenate([habit.novelty for habit in habits]),
+        np.concatenate([[0], np.cumsum(layout.outputs)]).astype(np.int64),
+        np.concatenate([habit.base for habit in habits]),
+        np.asarray([still]),
+        np.zeros(1),
+    )
+
+
+def _by_partner(nodes: Nodes, answered: Sequence[tuple[Question, Ints]], begin: int, cardinality: int, n_ways: int) -> list[Ints]:
+    """Entries (pair, value, node) [N, 3] of a unit that has a partner: what the action is, nodes ask for if at all."""
+    rows = [np.stack([*np.divmod(q.pairs, cardinality), q.values, first], axis=1) for q, first in answered]
+    columns = answered[0][0].partner
+    assert columns is not None
+    now, value, node = chained(np.concatenate(rows), columns, nodes.add, nodes.add(-1, 0, 0)).T
+    return [np.stack([begin + way * cardinality + now, value, node], axis=1) for way in range(n_ways)]
+
+
+@compiled
+def read(state: Ints, unit: int, layout: Layout) -> int:
+    """Value of a unit in a state [F]; 0 for ``terminated`` and the event."""
+    first, last = layout.first[unit], layout.first[unit + 1]
+    if last - first == 1:
+        return int(state[layout.members[first]])
+    for member in range(first, last):
+        if state[layout.members[member]] == 1:
+            return int(member - first)
+    return 0
+
+
+@compiled
+def write(state: Ints, unit: int, value: int, layout: Layout) -> None:
+    """Sets a unit's value in a state [F]."""
+    first, last = layout.first[unit], layout.first[unit + 1]
+    if last - first == 1:
+        state[layout.members[first]] = value
+    elif last > first:
+        for member in range(first, last):  # all of them: a state may have come with several on
+            state[layout.members[member]] = 1 if member == first + value else 0
+
+
+@compiled
+def show(state: Ints, action: int, layout: Layout, on: Bools) -> None:
+    """Writes which columns are on to ``on`` [D]."""
+    n = len(layout.factor)
+    for column in range(n):
+        value = state[layout.factor[column]]
+        on[column] = layout.value[column] <= value <= layout.top[column]
+    acts = layout.acts
+    on[n : n + acts.n_columns] = False
+    for i in range(acts.first[action], acts.first[action + 1]):
+        on[n + acts.column[i]] = True
+    n += acts.n_columns
+    for m in range(len(layout.meetings)):
+        on[n + m] = meets(state, layout.cells, layout.meetings[m])
+
+
+@compiled
+def meets(state: Ints, cells: Ints, meeting: Ints) -> bool:
+    """Whether a meeting (see ``units.Layout``) takes place in a state [F]."""
+    _, height, width = cells.shape
+    below, right = meeting[4], meeting[5]
+    for y in range(height):
+        for x in range(width):
+            if state[cells[meeting[0], y, x]] == meeting[1]:
+                row, column = y + below, x + right
+                inside = 0 <= row < height and 0 <= column < width
+                if meeting[2] == BEYOND:
+                    if not inside:
+                        return True
+                elif inside and state[cells[meeting[2], row, column]] == meeting[3]:
+                    return True
+    return False
+
+
+@compiled
+def n_columns(layout: Layout) -> int:
+    """Number of columns D."""
+    return len(layout.factor) + layout.acts.n_columns + len(layout.meetings)
+
+
+@compiled
+def show_next(following: Ints, layout: Layout, on: Bools) -> None:
+    """Writes which columns a next state [F] has on, after those of the state in ``on``."""
+    n = n_columns(layout)
+    for column in range(len(layout.factor)):
+        value = following[layout.factor[column]]
+        on[n + column] = layout.value[column] <= value <= layout.top[column]
+
+
+@compiled
+def show_next_meetings(following: Ints, layout: Layout, on: Bools) -> None:
+    """Writes what meets what in a next state [F], after all other columns."""
+    n = n_columns(layout) + len(layout.factor)
+    for m in range(len(layout.next_meetings)):
+        on[n + m] = meets(following, layout.cells, layout.next_meetings[m])
+
+
+@inlined
+def without_noise(rate: float, spread: float, n: int, noise: float) -> float:
+    """A leaf's rate for planning, of one of ``n`` values; negative where it counts only if it is not negligible.
+
+    Leaves whose rows all agree, as ``spread`` tells, are sure. Bits are decided at once, other values once all are known.
+    """
+    if noise == 0.0 or spread > 0.0:
+        return rate
+    if 1.0 - rate < noise * rate:
+        return 1.0
+    if n > 2:
+        return -rate
+    return 0.0 if rate < noise * (1.0 - rate) else rate
+
+
+@compiled
+def with_rest(
+    out: Floats,
+    base: Floats,
+    start: int,
+    n: int,
+    value: int,
+    total: float,
+    slack: float,
+    stays: float,
+    novelty: float,
+    known: bool,
+    asked: bool,
+    noise: float,
+) -> None:
+    """Completes a unit's distribution, ``out`` from ``start`` on, by the present value and by what never came.
+
+    The graphs give the rates of all values but the present one, which has the rest. Where the unit was never seen to stay, the
+    rest is taken for an error of estimation unless it is larger than such an error can be; for planning, also where graphs ask
+    for anything (``asked``), so that rows in which it stayed may have been others, and it is much less than in all rows.
+    """
+    stay = 1.0 - total
+    observed = not known or (stays > 0.0 and (stay > slack or not asked or stay >= 0.5 * stays))
+    if known:
+        stay = max(0.0, stay - slack) if stays == 0.0 else max(stay, min(slack, stays))
+    out[start + value] = stay if observed or noise == 0.0 else -stay
+    scale, top, left = (1.0 - novelty) / (total + stay), 0.0, 0.0
+    for k in range(start, start + n):
+        top = max(top, abs(out[k]) * scale + novelty * base[k])
+    for k in range(start, start + n):
+        chance = abs(out[k]) * scale + novelty * base[k]
+        out[k] = chance if out[k] > 0.0 or chance >= noise * top else 0.0
+        left += out[k]
+    for k in range(start, start + n if noise > 0.0 else start):
+        out[k] /= left
+
+
+@compiled
+def distributions(
+    units: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs, on: Bools, values: Ints, out: Floats
+) -> None:
+    """Writes value and next distribution of some units to ``values`` [U] and, from ``start[unit]`` on, to ``out``.
+
+    All units are done in one call: handing the graphs over costs more than a unit does.
+    """
+    for unit in units:
+        first, n, start = layout.first[unit], layout.outputs[unit], graphs.start[unit]
+        value = state[layout.members[first]] if layout.first[unit + 1] == first + 1 else 0
+        if layout.first[unit + 1] > first + 1:
+            for member in range(first, layout.first[unit + 1]):
+                if state[layout.members[member]] == 1:
+                    value = member - first
+                    break
+        values[unit] = value
+        noise = graphs.noise[0]
+        pair = graphs.pairs[unit] + layout.acts.way[action] * n + value
+        total, slack, asked = 0.0, 0.0, False
+        for k in range(start, start + n):
+            out[k] = 0.0
+        for entry in range(graphs.entries[pair], graphs.entries[pair + 1]):
+            node = graphs.nodes[entry]
+            asked |= graphs.column[node] >= 0
+            while graphs.column[node] >= 0:
+                node = graphs.on[node] if on[graphs.column[node]] else graphs.off[node]
+            rate = without_noise(graphs.rate[node], graphs.spread[node], n, noise)
+            out[start + graphs.values[entry]] = rate
+            total += abs(rate)
+            slack += 3.0 * graphs.spread[node]
+        known = graphs.entries[pair + 1] > graphs.entries[pair]
+        if n == 2:
+            still = graphs.still[0] if graphs.still[0] >= noise else 0.0
+            rate = out[start + 1] if known else still if value == 0 else 1.0 - still
+            out[start], out[start + 1] = 1.0 - rate, rate
+            continue
+        with_rest(out, graphs.base, start, n, value, total, slack, graphs.stays[pair], graphs.novelty[pair], known, asked, noise)

@@ -1,0 +1,400 @@
+"""Fitting decision graphs to transitions: variables, resets, targets, splits, and synchronic arcs.
+
+A variable may depend on the next values of others (synchronic arcs, the paper's conditioner of section 3.2). Only variables whose
+errors are correlated with those of an earlier one get such arcs, and, as with a causal mask, variable i sees y_<i alone, so that
+probabilities stay exact. Whether the episode ends comes last: it mostly depends on the next state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammainc, ndtr
+
+from mbagent.data import Factors, TransitionBatch
+from mbagent.models.dbn import sampling
+from mbagent.models.dbn.arrays import Graphs, build
+from mbagent.models.dbn.effects import WHERE, Asking, ask_in, for_all_ways, habit_in
+from mbagent.models.dbn.features import (
+    Acts,
+    Layout,
+    Question,
+    Seen,
+    column_kinds,
+    column_table,
+    coupled_layout,
+    distinct,
+    is_lone_bit,
+    lay_out,
+    shown,
+    unit_values,
+)
+from mbagent.models.dbn.mutex import find_cliques, find_groups
+from mbagent.models.dbn.split_search import find_splits
+from mbagent.models.dbn.splits import Search
+from mbagent.models.systematic_sampling import NEGLIGIBLE
+from mbagent.types import Bools, Floats, Ints
+
+USUAL = 0.95
+"""Share of transitions that are taken for usual in any case."""
+
+
+def flag_events(states: Factors, next_states: Factors) -> Bools:
+    """Which transitions look like a rare event, bool [N].
+
+    Those that change more than twice as many factors as nearly all others, and those that change factors which otherwise
+    never change.
+
+    Args:
+        states: int [N, F].
+        next_states: int [N, F].
+    """
+    changed = states != next_states
+    count = changed.sum(axis=1)
+    usual = count <= 2 * max(1.0, float(np.quantile(count, USUAL))) if len(count) else np.ones(0, dtype=np.bool_)
+    still = ~changed[usual].any(axis=0)
+    events: Bools = changed[:, still].any(axis=1)
+    return events
+
+
+UNCERTAIN = 2.0
+"""Variance summed over all rows from which a column counts as uncertain."""
+
+MANY = 8.0
+"""Products of two columns' variances summed over all rows from which the sum of their errors' products is about normal."""
+
+APART = 6.0
+"""Standard errors that two columns' errors must go together by, beyond what the largest of so many reaches by chance."""
+
+MOST_ENTRIES = 4_000_000
+"""Entries of the table of errors; of more rows, evenly chosen ones are looked at."""
+
+
+AT_ONCE = 2000
+"""Rows that are handed to the compiled kernels at once, which read wide integers."""
+
+
+def uncertain_rows(rows: TransitionBatch, layout: Layout, graphs: Graphs, units: Ints) -> Bools:
+    """In which rows some units need their late graphs, bool [N, len(units)]."""
+    found = [sampling.uncertain(part.states, part.actions, layout, graphs, units) for part in rows.parts(AT_ONCE)]
+    return np.concatenate([np.zeros((0, len(units)), dtype=np.bool_), *found])
+
+
+class Asked(NamedTuple):
+    """What a unit is asked again with.
+
+    Attributes:
+        unit: its number.
+        columns: columns of the next state, numbered as those of the state.
+    """
+
+    unit: int
+    columns: Ints
+
+
+def probabilities(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Floats:
+    """Probability of each state column after each row, each for itself, [N, D']."""
+    sizes = np.full(layout.n_factors, 2, dtype=np.int64)
+    np.maximum.at(sizes, layout.factor, layout.top + 1)
+    start = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    probs = np.empty((len(rows), int(start[-1])))
+    sampling.marginals(rows.states, rows.actions, layout, graphs, start, probs)
+    total = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(probs, axis=1)], axis=1)
+    result: Floats = total[:, start[layout.factor] + layout.top + 1] - total[:, start[layout.factor] + layout.value]
+    return result.clip(0.0, 1.0)
+
+
+def go_together(error: Floats, other: Floats, spread: Floats, other_spread: Floats, n_tried: int) -> bool:
+    """Whether two columns' errors [...] go together, given their variances [...], one of ``n_tried`` such questions."""
+    one, two, three, four = (part.reshape(-1, 1) for part in (error, other, spread, other_spread))
+    return bool(_telling(one, two, three, four, n_tried)[0, 0])
+
+
+def _telling(error: Floats, other: Floats, spread: Floats, other_spread: Floats, n_tried: int) -> Bools:
+    """Which columns' errors go together, bool [D, E], from errors and variances [N, D] and [N, E].
+
+    Of many by the sum of products of errors; of rare values by how often both came unexpectedly in the same row, which by
+    chance has a Poisson distribution.
+    """
+    limit = APART + np.sqrt(2.0 * np.log(max(n_tried, 2)))
+    products, variances = error.T @ other, spread.T @ other_spread
+    result: Bools = (variances > MANY) & (np.abs(products) > limit * np.sqrt(variances))
+    few = variances <= MANY
+    if few.any():
+        both = _unexpected(error).T @ _unexpected(other)
+        expected = _least(spread).T @ _least(other_spread)
+        result |= few & (both > 0.0) & (gammainc(np.maximum(both, 1.0), expected) < ndtr(-limit))  # P(Poisson >= both)
+    return result
+
+
+def _unexpected(error: Floats) -> Floats:
+    """1 where what came was the less probable, else 0."""
+    result: Floats = (np.abs(error) > 0.5).astype(np.float64)
+    return result
+
+
+def _least(spread: Floats) -> Floats:
+    """Probability of the less probable of two values, of the variance."""
+    result: Floats = 0.5 - np.sqrt(np.maximum(0.25 - spread, 0.0))
+    return result
+
+
+def find_dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, usual: Ints) -> list[Asked]:
+    """Units to be asked again, in order, with what; ``terminated`` last, with all that changes.
+
+    Args:
+        layout: the units, with their couplings.
+        graphs: of each for itself.
+        rows: N transitions.
+        usual: those that are no rare events, int64 [R].
+    """
+    n_columns, last = len(layout.factor), len(layout.outputs) - 2
+    unit_of = np.empty(layout.n_factors, dtype=np.int64)
+    unit_of[layout.members] = np.repeat(np.arange(len(layout.outputs)), np.diff(layout.first))
+    owner = unit_of[layout.factor]
+    most = max(1000, MOST_ENTRIES // max(n_columns, 1))
+    some = rows.select(usual[np.linspace(0, len(usual) - 1, min(len(usual), most)).astype(np.int64)])
+    found = [Asked(unit, columns) for unit, columns in _dependent(layout, graphs, some, owner).items()]
+    if last in graphs.changing:
+        found.append(Asked(last, np.flatnonzero(np.isin(owner, graphs.changing))))
+    return found
+
+
+def _dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, owner: Ints) -> Mapping[int, Ints]:
+    """Columns of earlier units whose errors go with those of a unit, by unit in ascending order."""
+    if len(rows) == 0 or len(owner) == 0:
+        return {}
+    probs = probabilities(layout, graphs, rows)
+    spread = probs * (1.0 - probs)
+    uncertain = np.flatnonzero(spread.sum(axis=0) > UNCERTAIN)
+    error = shown(layout, rows.after, uncertain) - probs[:, uncertain]
+    telling = np.zeros((len(uncertain), len(uncertain)), dtype=np.bool_)
+    for action in np.unique(rows.actions):  # what goes together under one action may go apart under another
+        e, v = error[rows.actions == action], spread[rows.actions == action][:, uncertain]
+        telling |= _telling(e, e, v, v, len(uncertain))
+    unit, coupling = owner[uncertain], layout.coupling_of[owner[uncertain]]
+    earlier = unit[:, None] < unit
+    together = (coupling[:, None] == coupling) & (coupling >= 0)
+    goes = earlier & ~together & (coupling < 0) & telling
+    return {
+        int(u): uncertain[goes[:, unit == u].any(axis=1)] for u in np.unique(unit[goes.any(axis=0)]) if goes[:, unit == u].any()
+    }
+
+
+NO_MANNERS: Mapping[int, Asking] = MappingProxyType({})
+"""All factors are asked where they go."""
+
+SOME_ROWS = 4000
+"""Rows on which it is looked at how often bits should be on together."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What was found.
+
+    Attributes:
+        layout: the units.
+        usual: graphs of all units, each for itself, and of whether the event happens.
+        late: graphs of the units that are drawn after the others, given what those became, in order.
+        event: graphs of what happens in an event; as ``usual`` where there is none.
+        has_event: whether there is one.
+        asked, found: questions and splits behind ``usual`` and ``late``.
+    """
+
+    layout: Layout
+    usual: Graphs
+    late: Graphs
+    event: Graphs
+    has_event: bool
+    asked: Sequence[Question]
+    found: Sequence[Search]
+
+
+def for_planning(fitted: Fitted) -> Fitted:
+    """The graphs as planners read them: what no observation stands behind is no outcome, all else is one, however rare."""
+    noise = np.full(1, NEGLIGIBLE)
+    usual, late, event = (graphs._replace(noise=noise) for graphs in (fitted.usual, fitted.late, fitted.event))
+    return replace(fitted, usual=usual, late=late, event=event)
+
+
+class _Table:
+    """Transitions as units and columns.
+
+    Args:
+        layout: the units.
+        rows: N transitions.
+        events: which of them are rare events, bool [N].
+        manners: how factors are asked about, if not where they go.
+        since: first row that counts for each factor and for ``terminated``, int64 [F + 1]; None for all.
+    """
+
+    def __init__(
+        self, layout: Layout, rows: TransitionBatch, events: Bools, manners: Mapping[int, Asking], since: Ints | None
+    ) -> None:
+        """See the class."""
+        self.layout, self.rows = layout, rows
+        self.since = np.zeros(len(layout.outputs), dtype=np.int64)
+        if since is not None:
+            members = [layout.members[begin:end] for begin, end in zip(layout.first, layout.first[1:], strict=False)]
+            self.since[:-2] = [since[factors].max() for factors in members[:-2]]
+            self.since[-2] = since[-1]
+        lone = np.flatnonzero(np.diff(layout.first) == 1)
+        self.manners = {int(unit): manners.get(int(layout.members[layout.first[unit]]), WHERE) for unit in lone}
+        flags = np.stack([rows.terminated, events], axis=1).astype(np.uint8)
+        self.now = np.concatenate([unit_values(layout, rows.before), np.zeros_like(flags)], axis=1)
+        self.then = np.concatenate([unit_values(layout, rows.after), flags], axis=1)
+        first, self.pattern = distinct(rows.before, rows.actions)
+        self.first, self.columns = first, column_table(layout, rows.before[first], rows.actions[first])
+
+    def ask(self, unit: int, which: Ints) -> list[Question]:
+        """The questions about a unit, of some rows."""
+        return self.questions(unit, self.seen(unit).select(self.counting(unit, which)))
+
+    def counting(self, unit: int, which: Ints) -> Ints:
+        """Those of some rows that count for a unit."""
+        result: Ints = which[which >= self.since[unit]]
+        return result
+
+    def questions(self, unit: int, seen: Seen) -> list[Question]:
+        """The questions about a unit, of rows with whatever looks."""
+        manner, partner = self.manners.get(unit, WHERE)
+        n_ways = self.layout.acts.n_ways if partner is None else partner.cardinality
+        asked = ask_in(manner, unit, int(self.layout.outputs[unit]), n_ways, seen)
+        return asked if partner is None else [replace(one, partner=partner.columns(self.layout)) for one in asked]
+
+    def seen(self, unit: int) -> Seen:
+        """A unit's values in all rows, with the action or what takes its place."""
+        now, then = (values[:, unit].astype(np.int64) for values in (self.now, self.then))
+        partner = self.manners.get(unit, WHERE).partner
+        ways = self.layout.acts.way[self.rows.actions] if partner is None else partner.of(self.rows)
+        return Seen(self.pattern, ways, now, then)
+
+    def kinds(self, seen: Ints) -> Ints:
+        """Kind of each column, by some rows."""
+        changing = (self.rows.before[seen] != self.rows.after[seen]).any(axis=0)
+        return column_kinds(self.layout, self.rows.before[seen], changing)
+
+    def build(self, asked: Sequence[Question], found: Sequence[Search], seen: Ints, still: float) -> Graphs:
+        """The graphs; habits are those of the rows seen."""
+        habits, n_ways = [], self.layout.acts.n_ways
+        for unit, cardinality in enumerate(self.layout.outputs):
+            some, (manner, partner) = self.seen(unit).select(self.counting(unit, seen)), self.manners.get(unit, WHERE)
+            habit = habit_in(manner, int(cardinality), n_ways if partner is None else partner.cardinality, some)
+            habits.append(habit if partner is None else for_all_ways(habit, partner.cardinality, n_ways))
+        return build(self.layout, asked, found, habits, still)
+
+
+def nothing_late(graphs: Graphs) -> Graphs:
+    """Graphs of no unit, for where nothing is drawn late."""
+    return graphs._replace(changing=np.zeros(0, dtype=np.int64), column=np.full_like(graphs.column, -1))
+
+
+def fit_graphs(
+    cardinalities: Sequence[int],
+    acts: Acts,
+    rows: TransitionBatch,
+    events: Bools,
+    in_pairs: bool = True,
+    jointly: bool = True,
+    manners: Mapping[int, Asking] = NO_MANNERS,
+    since: Ints | None = None,
+) -> Fitted:
+    """Fits everything.
+
+    Args:
+        cardinalities: number of values of each factor.
+        acts: the actions.
+        rows: N transitions.
+        events: which of them are rare events, bool [N].
+        in_pairs: whether to look for causes that matter only together, which takes most of the time.
+        jointly: whether to look for units that hang on what others become.
+        manners: how factors are asked about, if not where they go.
+        since: first row that counts for each factor and for ``terminated``, int64 [F + 1]; None for all.
+    """
+    groups = find_groups(cardinalities, rows.before, rows.after, ~events)
+    layout = lay_out(cardinalities, groups, acts)
+    table, usual = _Table(layout, rows, events, manners, since), np.flatnonzero(~events)
+    last = len(layout.outputs) - 1
+    asked_of = {unit: np.arange(len(rows)) if unit == last else usual for unit in range(last + 1)}
+    graphs, asked, found = _graphs(table, asked_of, usual, True, in_pairs)
+    layout = _coupled(layout, graphs, rows)
+    late = nothing_late(graphs)
+    if jointly:
+        late, more_asked, more_found = _late_graphs(table, layout, graphs, usual, in_pairs)
+        asked, found = [*asked, *more_asked], [*found, *more_found]
+    event = graphs
+    if events.any():
+        rare = np.flatnonzero(events)
+        event, _, _ = _graphs(table, dict.fromkeys(range(last), rare), rare, False, in_pairs)
+    return Fitted(layout, graphs, late, event, bool(events.any()), asked, found)
+
+
+def _late_graphs(
+    table: _Table, layout: Layout, graphs: Graphs, usual: Ints, in_pairs: bool
+) -> tuple[Graphs, list[Question], list[Search]]:
+    """Graphs of units that hang on what others become, with questions and splits."""
+    rows, kinds, n_columns = table.rows, table.kinds(usual), table.columns.shape[1]
+    late, all_asked, all_found = [], [], []
+    for unit, columns in find_dependent(layout, graphs, rows, usual):
+        counting = table.counting(unit, usual)
+        needed = uncertain_rows(rows.select(counting), layout, graphs, np.asarray([unit]))[:, 0]
+        some = table.seen(unit).select(counting[needed])
+        following = shown(layout, rows.after[counting[needed]], columns)
+        first, pattern = distinct(following, some.pattern)
+        asked = table.questions(unit, replace(some, pattern=pattern))
+        more_kinds = np.concatenate([kinds, kinds.max(initial=0) + 1 + kinds[columns]])
+        more = np.concatenate([table.columns[some.pattern[first]], following[first]], axis=1)
+        found = find_splits([q.head for q in asked], more, more_kinds, layout.acts.n_ways, in_pairs)
+        if any(split.column >= n_columns for search in found for split in search.splits):
+            numbers = np.concatenate([np.arange(n_columns), n_columns + columns])
+            late.append(unit)
+            all_asked += asked
+            all_found += [search.renamed(numbers) for search in found]
+    if not late:
+        return nothing_late(graphs), [], []
+    built = table.build(all_asked, all_found, usual, float(graphs.still[0]))
+    return built._replace(changing=np.asarray(late, dtype=np.int64)), all_asked, all_found
+
+
+def _coupled(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Layout:
+    """The layout with those bits coupled that are never on together, though each for itself might be."""
+    bits = graphs.changing[is_lone_bit(layout)[graphs.changing]]
+    if len(bits) < 2 or len(rows) == 0:
+        return layout
+    factors = layout.members[layout.first[bits]]
+    on = rows.after[:, factors].astype(np.float32)
+    some = np.linspace(0, len(rows) - 1, min(len(rows), SOME_ROWS)).astype(np.int64)
+    start = np.concatenate([[0], np.cumsum(_cardinalities(layout))]).astype(np.int64)
+    probs = np.empty((len(some), int(start[-1])))
+    few = rows.select(some)
+    sampling.marginals(few.states, few.actions, layout, graphs, start, probs)
+    ones = probs[:, start[factors] + 1]
+    expected = ones.T @ ones * (len(rows) / len(some))
+    return coupled_layout(layout, [bits[c] for c in find_cliques(np.rint(on.T @ on).astype(np.int64), expected)])
+
+
+def _cardinalities(layout: Layout) -> NDArray[np.int64]:
+    """Number of values of each factor."""
+    cardinalities = np.full(layout.n_factors, 2, dtype=np.int64)
+    lone = np.flatnonzero(np.diff(layout.first) == 1)
+    cardinalities[layout.members[layout.first[lone]]] = layout.outputs[lone]
+    return cardinalities
+
+
+def _graphs(
+    table: _Table, asked_of: dict[int, Ints], seen: Ints, regular: bool, in_pairs: bool
+) -> tuple[Graphs, list[Question], list[Search]]:
+    """Graphs of some units, each asked of some rows; ``seen`` are the rows of this regime.
+
+    In a ``regular`` regime units that never changed are all taken together for how likely they are to change; where
+    anything may change, each for itself.
+    """
+    asked = [question for unit, which in asked_of.items() for question in table.ask(unit, which)]
+    found = find_splits([q.head for q in asked], table.columns, table.kinds(seen), table.layout.acts.n_ways, in_pairs)
+    still = 0.5 / (len(seen) * (len(table.layout.outputs) if regular else 1) + 1.0)
+    return table.build(asked, found, seen, still), asked, found

@@ -1,0 +1,222 @@
+"""From graphs of relative columns, one for each channel, to graphs for every cell of a board of any size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from mbagent.models.dbn.arrays import Graphs, linked, n_columns
+from mbagent.models.dbn.features import Acts, Layout, coupled_layout, lay_out
+from mbagent.models.dbn.invariants import LAWLESS, Laws, radix
+from mbagent.models.dbn.plane_features import ACTION, BORDER, MEETING, NEXT, NEXT_MEETING, WRAP
+from mbagent.spaces import PlaneLayout
+from mbagent.types import Ints
+
+WHOLE, ROW, COLUMN = 0, 1, 2
+"""What cells of a channel a coupling is about."""
+
+
+class Coupling(NamedTuple):
+    """Cells of a channel of which at most one is on after a step.
+
+    Attributes:
+        channel: the channel, of bits.
+        kind: WHOLE, ROW or COLUMN.
+        line: which row or column, from the top or left; counted from the other end, -1 first, where it lies nearer to that.
+        exactly: whether it is exactly one.
+    """
+
+    channel: int
+    kind: int
+    line: int
+    exactly: bool
+
+    def lies_on(self, height: int, width: int) -> bool:
+        """Whether a board has this line at all."""
+        length = {WHOLE: 1, ROW: height, COLUMN: width}[self.kind]
+        return -length <= self.line < length
+
+    def cells(self) -> tuple[slice | int, slice | int]:
+        """Its rows and columns."""
+        rows = self.line if self.kind == ROW else slice(None)
+        columns = self.line if self.kind == COLUMN else slice(None)
+        return rows, columns
+
+
+@dataclass(frozen=True)
+class LocalGraphs:
+    """What holds at every position.
+
+    Attributes:
+        graphs: units are the channels, then ``terminated`` and the event; columns are relative.
+        late: those of channels whose cells are drawn late, from the upper left on, channel after channel.
+        columns: the relative columns, int64 [D, 7], see ``windows.py``.
+        cardinalities: number of values of each channel's cells, length C.
+        acts: the actions.
+        couplings: bits of which at most one is on.
+        laws: what every state keeps to.
+    """
+
+    graphs: Graphs
+    late: Graphs
+    columns: Ints
+    cardinalities: tuple[int, ...]
+    acts: Acts
+    couplings: tuple[Coupling, ...]
+    laws: Laws = LAWLESS
+
+
+def instantiate(local: LocalGraphs, board: PlaneLayout) -> tuple[Layout, Graphs, Graphs]:
+    """Units, graphs and late graphs for a board."""
+    n_factors = board.channels * board.height * board.width
+    cells = board.to_planes(np.arange(n_factors)[None])[0]
+    cardinalities = np.empty(n_factors, dtype=np.int64)
+    for channel, values in enumerate(local.cardinalities):
+        cardinalities[cells[channel]] = values
+    asked = np.concatenate([local.graphs.column, local.late.column])
+    used = np.unique(asked[asked >= 0])
+    meetings, later = (used[local.columns[used, 0] == kind] for kind in (MEETING, NEXT_MEETING))
+    layout = lay_out([int(c) for c in cardinalities], (), local.acts, ordinal=False)
+    now, then = (np.ascontiguousarray(local.columns[numbers, 1:]) for numbers in (meetings, later))
+    layout = layout._replace(cells=cells, meetings=now, next_meetings=then, weights=radix(local.cardinalities))
+    layout = with_couplings(with_laws(layout, local.laws), local.couplings)
+    numbers = {int(d): len(layout.factor) + layout.acts.n_columns + i for i, d in enumerate(meetings)}
+    numbers |= {int(d): n_columns(layout) + len(layout.factor) + i for i, d in enumerate(later)}
+    graphs, late = (_Board(local, layout, numbers).graphs(which) for which in (local.graphs, local.late))
+    units = [layout.cells[c].ravel() if c < len(cells) else np.asarray([n_factors]) for c in local.late.changing]
+    order = np.concatenate([*units, np.zeros(0, dtype=np.int64)])
+    return layout, graphs, late._replace(changing=order[layout.coupling_of[order] < 0])
+
+
+def with_laws(layout: Layout, laws: Laws) -> Layout:
+    """The layout with other laws."""
+    return layout._replace(counts=laws.counts, met=laws.met)
+
+
+def with_couplings(layout: Layout, couplings: Sequence[Coupling]) -> Layout:
+    """The layout with its couplings; a cell is in the first that claims it."""
+    of, exactly = layout.coupling_of.copy(), []
+    groups: list[Ints] = []
+    _, height, width = layout.cells.shape
+    for coupling in couplings:
+        if not coupling.lies_on(height, width):
+            continue
+        members = layout.cells[coupling.channel][coupling.cells()].ravel()
+        members = members[of[members] < 0]
+        if len(members) > 1:
+            of[members] = len(groups)
+            groups.append(members)
+            exactly.append(coupling.exactly)
+    return coupled_layout(layout, groups, exactly)
+
+
+class _Board:
+    """Graphs of all cells while they are built. A cell's unit has the number of its factor."""
+
+    def __init__(self, local: LocalGraphs, layout: Layout, meetings: dict[int, int]) -> None:
+        self.local, self.layout, self.relative = local, layout, local.graphs
+        self.links: list[tuple[int, int, int]] = []
+        self.leaves: list[int] = []
+        self.columns: list[list[int]] = local.columns.tolist()
+        self.first_column = np.searchsorted(layout.factor, np.arange(layout.n_factors))
+        self.meetings = meetings
+
+    def graphs(self, graphs: Graphs) -> Graphs:
+        """All of them, from those of relative columns."""
+        local, layout, self.relative = self.local, self.layout, graphs
+        _, height, width = layout.cells.shape
+        pairs = np.concatenate([[0], np.cumsum(layout.acts.n_ways * layout.outputs)]).astype(np.int64)
+        shared = {int(node): self._add(-1, 0, 0, int(node)) for node in np.flatnonzero(graphs.column < 0)}
+        channel_of = np.full(len(layout.outputs), len(local.cardinalities))
+        entries: list[tuple[int, int, int]] = []
+        for channel in graphs.changing:
+            nodes = self._nodes_of(int(channel))
+            places = (
+                [(int(layout.cells[channel, y, x]), y, x) for y in range(height) for x in range(width)]
+                if channel < len(local.cardinalities)
+                else [(layout.n_factors, 0, 0)]
+            )
+            for unit, y, x in places:
+                copies = self._copy(nodes, shared, y, x)
+                entries += self._entries(int(channel), int(pairs[unit]), copies)
+        for channel in range(len(local.cardinalities)):
+            channel_of[layout.cells[channel]] = channel
+        channel_of[-1] = len(local.cardinalities) + 1
+        leaves = np.asarray(self.leaves, dtype=np.int64)
+        changing = np.flatnonzero(np.isin(channel_of, graphs.changing))
+        return Graphs(
+            changing.astype(np.int64),
+            pairs,
+            *linked(entries, int(pairs[-1]), self.links),
+            np.where(leaves >= 0, graphs.rate[leaves], 0.0),
+            np.where(leaves >= 0, graphs.spread[leaves], 0.0),
+            np.concatenate([graphs.stays[graphs.pairs[c] : graphs.pairs[c + 1]] for c in channel_of]),
+            np.concatenate([graphs.novelty[graphs.pairs[c] : graphs.pairs[c + 1]] for c in channel_of]),
+            np.concatenate([[0], np.cumsum(layout.outputs)]).astype(np.int64),
+            np.concatenate([graphs.base[graphs.start[c] : graphs.start[c + 1]] for c in channel_of]),
+            graphs.still,
+            graphs.noise,
+        )
+
+    def _add(self, column: int, off: int, on: int, leaf: int = -1) -> int:
+        self.links.append((column, off, on))
+        self.leaves.append(leaf)
+        return len(self.links) - 1
+
+    def _nodes_of(self, channel: int) -> list[int]:
+        """Inner nodes of a channel's graphs, children first."""
+        graphs = self.relative
+        begin, end = graphs.entries[graphs.pairs[channel]], graphs.entries[graphs.pairs[channel + 1]]
+        found: set[int] = set()
+        stack = [int(node) for node in graphs.nodes[begin:end]]
+        while stack:
+            node = stack.pop()
+            if node not in found and graphs.column[node] >= 0:
+                found.add(node)
+                stack += [int(graphs.off[node]), int(graphs.on[node])]
+        return sorted(found)
+
+    def _copy(self, nodes: Sequence[int], shared: dict[int, int], y: int, x: int) -> dict[int, int]:
+        """Nodes for a position; what the border decides there is decided."""
+        graphs, copies = self.relative, dict(shared)
+        for node in nodes:
+            off, on = copies[int(graphs.off[node])], copies[int(graphs.on[node])]
+            column = self._absolute(int(graphs.column[node]), y, x)
+            copies[node] = off if column == _NEVER or off == on else on if column == _ALWAYS else self._add(column, off, on)
+        return copies
+
+    def _absolute(self, relative: int, y: int, x: int) -> int:
+        """Column of the board that a relative column is at a position."""
+        _, height, width = self.layout.cells.shape
+        kind, *parts = self.columns[relative]
+        if kind == ACTION:
+            return len(self.layout.factor) + parts[0]
+        if kind in (MEETING, NEXT_MEETING):
+            return self.meetings[relative]
+        row, column = (y + parts[0], x + parts[1]) if kind == BORDER else (y + parts[2], x + parts[3])
+        inside = 0 <= row < height and 0 <= column < width
+        if kind == BORDER:
+            return _NEVER if inside else _ALWAYS
+        if inside == (kind == WRAP):
+            return _NEVER
+        row, column = row % height, column % width
+        value = parts[1] if self.local.cardinalities[parts[0]] != 2 else 0
+        begin = n_columns(self.layout) if kind == NEXT else 0
+        return int(begin + self.first_column[self.layout.cells[parts[0], row, column]]) + value
+
+    def _entries(self, channel: int, begin: int, copies: dict[int, int]) -> list[tuple[int, int, int]]:
+        """Entries (pair, value, node) of a unit whose pairs begin at ``begin``."""
+        graphs = self.relative
+        first, last = graphs.pairs[channel], graphs.pairs[channel + 1]
+        return [
+            (begin + int(pair - first), int(graphs.values[entry]), copies[int(graphs.nodes[entry])])
+            for pair in range(first, last)
+            for entry in range(graphs.entries[pair], graphs.entries[pair + 1])
+        ]
+
+
+_NEVER, _ALWAYS = -2, -3
+"""Columns that the border decides."""

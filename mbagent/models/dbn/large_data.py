@@ -1,0 +1,394 @@
+"""Planes with more transitions than fit into a table: distinct feature rows, and refinement of splits found in a sample.
+
+A feature table of every cell does not fit into memory where neighbourhoods have thousands of features. In most contexts that the
+splits lead to, all transitions agree. So all cells are counted by the few features split on, and only cells of contexts in which
+they disagree get a table of all features, rare outcomes first (compare RainForest, Gehrke et al. 1998).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.data import Factors, TransitionBatch
+from mbagent.models.dbn.arrays import Graphs, build
+from mbagent.models.dbn.features import Acts, Layout, Question, Seen, ask, distinct, lay_out
+from mbagent.models.dbn.plane_features import (
+    ACTION,
+    BORDER,
+    CELL,
+    MEETING,
+    NEXT_MEETING,
+    WRAP,
+    column_kinds,
+    column_planes,
+    column_values,
+    far_value,
+    known_columns,
+    told_by,
+    values_at,
+)
+from mbagent.models.dbn.score import Head, Tables, columns_of, evidence_tables, evidences
+from mbagent.models.dbn.smoothing import habit_of
+from mbagent.models.dbn.split_search import certainty, find_splits, go_on
+from mbagent.models.dbn.splits import Search, Split
+from mbagent.spaces import PlaneLayout
+from mbagent.types import Bools, Ints
+from mbagent_envs.jit import compiled
+
+MOST_CELLS = 200_000_000
+"""Entries of the table of columns that the search reads; of more transitions than that, some from all over are searched."""
+
+QUICK_CELLS = 50_000_000
+"""As MOST_CELLS, for a quick look that asks for single causes only."""
+
+FEWEST_CHANGES = 50
+"""Cells of a channel that must have changed as another's did, before it is taken for a copy."""
+
+MOST_COUNTED = 1_000_000_000
+"""Values of cells that are gone through in all, a byte each before and after a step."""
+
+CHUNK = 50_000_000
+"""Entries of the table that are made at once."""
+
+
+def channel_layout(cardinalities: Sequence[int], acts: Acts) -> Layout:
+    """Channels as the factors of a layout; its own columns mean nothing."""
+    return lay_out(cardinalities, (), acts, ordinal=False)
+
+
+def _counted(rows: TransitionBatch) -> tuple[TransitionBatch, Ints]:
+    """The rows that are gone through, and their numbers."""
+    most = max(1, MOST_COUNTED // max(1, rows.before.shape[1]))
+    if len(rows) <= most:
+        return rows, np.arange(len(rows))
+    counted = np.linspace(0, len(rows) - 1, most).astype(np.int64)
+    return rows.select(counted), counted
+
+
+class PlaneTable:
+    """Transitions of planes, as cells with their relative columns.
+
+    Attributes:
+        table: columns of the neighbourhood of all cells that look different, bool [looks, near].
+        whole: whether it is of all transitions.
+        most_looks: rows that a table for a search may have.
+        every: planes of all transitions and of their next states; of evenly chosen ones where that were over MOST_COUNTED.
+
+    Args:
+        rows: N transitions.
+        board: where cells lie.
+        cardinalities: number of values of each channel's cells, length C.
+        columns: all relative columns, int64 [D, 7].
+        acts: the actions.
+        since: first row that counts for each channel and for ``terminated``, int64 [C + 1]; None for all.
+        in_pairs: whether to look for causes that matter only together, which takes most of the time.
+    """
+
+    def __init__(
+        self,
+        rows: TransitionBatch,
+        board: PlaneLayout,
+        cardinalities: tuple[int, ...],
+        columns: Ints,
+        acts: Acts,
+        since: Ints | None = None,
+        in_pairs: bool = True,
+    ) -> None:
+        """See the class."""
+        self.in_pairs = in_pairs
+        self.board, self.cardinalities, self.columns, self.acts = board, cardinalities, columns, acts
+        self.n_cells = board.height * board.width
+        self.since = np.zeros(len(cardinalities) + 1, dtype=np.int64) if since is None else since
+        rows, counted = _counted(rows)
+        self.since = np.searchsorted(counted, self.since)
+        self.every = board.to_planes(rows.before), board.to_planes(rows.after)
+        self.every_action, self.every_since = rows.actions, self.since
+        known = known_columns(columns, *self.every)
+        kind = columns[known, 0]
+        here = np.isin(kind, (CELL, BORDER, ACTION, WRAP)) | ((kind == MEETING) & (columns[known, 5:] == 0).all(axis=1))
+        self.near, self.far, self.next_far = (
+            known[which] for which in (here, np.isin(kind, (MEETING, ACTION)), kind == NEXT_MEETING)
+        )
+        self.most_looks = (MOST_CELLS if in_pairs else QUICK_CELLS) // max(len(self.near), 1)
+        self.table, self.pattern, taken = self._looks(self.every[0], rows.actions)
+        self.whole = len(taken) == len(rows)
+        self.rows = rows if self.whole else rows.select(taken)
+        self.before, self.after = board.to_planes(self.rows.before), board.to_planes(self.rows.after)
+        self.since = np.searchsorted(taken, self.since)
+        self.actions = np.repeat(acts.way[self.rows.actions], self.n_cells)
+
+    def _looks(self, planes: Factors, actions: Ints) -> tuple[Bools, Ints, Ints]:
+        """Columns of all cells that look different, which each cell looks like, and which transitions that is of.
+
+        Transitions from all over are taken as long as there is room.
+        """
+        most, step = self.most_looks, max(1, CHUNK // (self.n_cells * max(len(self.near), 1)))
+        looks, n_parts = np.zeros((0, -(-len(self.near) // 8)), dtype=np.uint8), -(-len(planes) // step)
+        pattern, taken = [np.zeros((0, self.n_cells), dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+        for number in range(n_parts):
+            if len(looks) >= most:
+                break
+            part = np.arange(number, len(planes), n_parts)
+            packed = np.packbits(column_values(self.columns[self.near], planes[part], actions[part]), axis=1)
+            first, of = distinct(packed)
+            both, known = np.concatenate([looks, packed[first]]), len(looks)
+            kept, now = distinct(both)
+            renamed = np.argsort(np.argsort(kept, kind="stable"), kind="stable")[now]  # looks known before keep their numbers
+            looks = both[np.sort(kept)]
+            pattern.append(renamed[known:][of].reshape(len(part), self.n_cells))
+            taken.append(part)
+        rows = np.concatenate(taken)
+        order = np.argsort(rows)
+        table = np.unpackbits(looks, axis=1, count=len(self.near)).astype(np.bool_)
+        return table, np.concatenate(pattern)[order].ravel(), rows[order]
+
+    def seen(self, channel: int) -> Seen:
+        """A channel's values in all cells; looks are rows of ``table``."""
+        now, then = (planes[:, channel].reshape(-1).astype(np.int64) for planes in (self.before, self.after))
+        return Seen(self.pattern, self.actions, now, then).select(self.cells_since(channel))
+
+    def told_by(self, channel: int) -> Ints | None:
+        """Columns that alone tell what a channel becomes, see ``windows.told_by``; None where none do, or it changed rarely."""
+        before, after = (planes[:, channel] for planes in self.every)
+        if (before != after).sum() < FEWEST_CHANGES:
+            return None
+        return told_by(channel, self.columns, self.near, *self.every, self.every_action)
+
+    def copying(self, channel: int, columns: Ints) -> tuple[list[Question], Bools]:
+        """The questions about a channel that some columns alone tell all of, with the table of those columns."""
+        seen, cardinality = self.seen(channel), self.cardinalities[channel]
+        told = column_values(self.columns[columns], self.before, self.rows.actions)[self.cells_since(channel)]
+        value = np.concatenate([told, np.ones((len(told), 1), dtype=np.bool_)], axis=1).argmax(axis=1)
+        look = (seen.actions * cardinality + seen.now) * (len(columns) + 1) + value
+        first = np.full(self.acts.n_ways * cardinality * (len(columns) + 1), -1)
+        first[look[::-1]] = np.arange(len(look))[::-1]
+        return ask(channel, cardinality, replace(seen, pattern=look)), told[first]
+
+    def cells_since(self, channel: int) -> Ints:
+        """Numbers of the cells that count for a channel."""
+        return np.arange(min(self.since[channel] * self.n_cells, len(self.actions)), len(self.actions))
+
+    def far_values(self, numbers: Ints) -> Bools:
+        """Columns that are the same at all positions, bool [N, len(numbers)]."""
+        found = [far_value(self.columns[d], self.before, self.rows.actions, self.after) for d in numbers]
+        return np.stack(found, axis=1)
+
+    def split(self, asked: Sequence[Question], table: Bools, numbers: Ints) -> list[Search]:
+        """Splits by columns of a table, which have these numbers among the relative ones."""
+        kinds = column_kinds(self.columns)[numbers]
+        found = find_splits([q.head for q in asked], table, kinds, self.acts.n_ways, self.in_pairs)
+        return [search.renamed(numbers) for search in found]
+
+    def build(self, asked: Sequence[Question], found: Sequence[Search]) -> Graphs:
+        """Graphs of channels, ``terminated`` and the event that never happens."""
+        seen = [self.seen(channel) for channel in range(len(self.cardinalities))]
+        habits = [habit_of(k, self.acts.n_ways, s.actions, s.now, s.then) for k, s in zip(self.cardinalities, seen, strict=True)]
+        nothing, ends = np.zeros(len(self.rows), dtype=np.int64), self.rows.terminated.astype(np.int64)
+        habits += [habit_of(2, self.acts.n_ways, self.acts.way[self.rows.actions], nothing, then) for then in (ends, nothing)]
+        still = 0.5 / (len(self.actions) * len(self.cardinalities) + 1.0)
+        return build(channel_layout(self.cardinalities, self.acts), asked, found, habits, still)
+
+
+ROUNDS = 6
+"""Most times that all transitions are gone through."""
+
+WORTH = 10.0
+"""Evidence, nats, that could be gained in a context at most, below which nothing is looked for in it."""
+
+
+LEAST = 300
+"""Cells of the more frequent outcome that are taken at least."""
+
+
+def zoom(planes: PlaneTable, asked: Sequence[Question], found: list[Search]) -> list[Search]:
+    """Searches that go on in all transitions where some were searched; as they are where all were.
+
+    Args:
+        planes: the transitions.
+        asked: the questions about channels.
+        found: what was found for each in some transitions.
+
+    Returns:
+        Searches with further splits, whose rows are counts of all transitions: one for each context.
+    """
+    if planes.whole or not asked:
+        return found
+    followed = [_Followed(planes, question, search) for question, search in zip(asked, found, strict=True)]
+    most, certain = planes.most_looks, certainty(found)
+    for _ in range(ROUNDS):
+        if not _round(planes, followed, most, certain):
+            break
+    return [each.search() for each in followed]
+
+
+class _Followed:
+    """A question followed through all cells.
+
+    Attributes:
+        splits: all splits so far.
+        context: of each cell, int32 [N * P]; -1 where it is not asked.
+        n, e: cells and arrivals of each context, int64 [C].
+        action, value, typical: of each context, see ``Head`` and ``Search``.
+        closed: contexts in which nothing more was found, bool [C].
+    """
+
+    def __init__(self, planes: PlaneTable, question: Question, search: Search) -> None:
+        self.planes, self.question, self.channel = planes, question, question.unit
+        self.splits: list[Split] = []
+        cardinality = planes.cardinalities[self.channel]
+        context = np.full(planes.acts.n_ways * cardinality, -1, dtype=np.int32)
+        context[question.pairs] = np.arange(len(question.pairs))
+        now = planes.every[0][:, self.channel].reshape(len(planes.every_action), -1)
+        self.context = context[(planes.acts.way[planes.every_action] * cardinality)[:, None] + now].ravel()
+        self.context[: planes.every_since[self.channel] * planes.n_cells] = -1
+        self.action, self.value, self.typical = search.head.action, search.head.value, search.typical
+        self.closed = np.zeros(len(self.action), dtype=np.bool_)
+        self.follow(search.splits)
+
+    def came(self) -> Bools:
+        """In which cells the value came, bool [N * P]."""
+        result: Bools = (self.planes.every[1][:, self.channel] == self.question.values[0]).ravel()
+        return result
+
+    def follow(self, splits: Sequence[Split]) -> None:
+        """Takes all cells through further splits, and counts them."""
+        planes = self.planes
+        used = np.unique([split.column for split in splits if split.column >= 0]).astype(np.int64)
+        which = np.asarray([np.searchsorted(used, s.column) if s.column >= 0 else -1 for s in splits], dtype=np.int64)
+        targets = np.concatenate([np.zeros((2, 0), dtype=np.int64), *(np.stack([s.off, s.on]) for s in splits)], axis=1)
+        first = np.concatenate([[0], np.cumsum([len(s.off) for s in splits])]).astype(np.int64)
+        step = max(1, CHUNK // (planes.n_cells * (len(used) + 1)))
+        for begin in range(0, len(planes.every_action), step):
+            part = slice(begin, begin + step)
+            values = column_planes(planes.columns[used], planes.every[0][part], planes.every_action[part])
+            cells = self.context[begin * planes.n_cells : (begin + step) * planes.n_cells]
+            _walk(values.reshape(len(used), len(cells)), which, first, targets, cells)
+        self.splits += splits
+        asked, size = self.context >= 0, len(self.action)
+        self.n = np.bincount(self.context[asked], minlength=size)
+        self.e = np.bincount(self.context[asked & self.came()], minlength=size)
+
+    def search(self) -> Search:
+        """The splits, with counts for rows."""
+        contexts = np.arange(len(self.action))
+        search = Search(Head(contexts, self.n, self.e, contexts, self.action, self.value))
+        search.splits, search.typical = self.splits, self.typical
+        return search
+
+    def open_contexts(self, tables: Tables) -> Bools:
+        """Contexts in which cells disagree, bool [C]."""
+        result: Bools = ~self.closed & (-evidences(self.e, self.n, tables) > WORTH) & (self.e > 0) & (self.e < self.n)
+        return result
+
+    def graft(self, found: Sequence[Search], contexts: Ints, near: Ints) -> bool:
+        """Takes over what was found in some contexts; whether anything was.
+
+        Args:
+            found: a search of each, whose columns are numbers of ``near``.
+            contexts: ascending, int64 [K].
+            near: columns.
+        """
+        splits, rates = [], self.e / np.maximum(self.n, 1)
+        for context, search in zip(contexts[::-1], found[::-1], strict=True):  # those before keep their numbers
+            if not search.splits:
+                self.closed[context] = True
+                continue
+            size, head = len(self.action), search.head
+            kept = np.delete(np.arange(size), context)
+            order = np.empty(size, dtype=np.int64)
+            order[kept], order[context] = np.arange(size - 1), size - 1
+            splits.append(Split(-1, order, order, 0.0))
+            for split in search.splits:
+                off, on = (np.concatenate([np.arange(size - 1), size - 1 + side]) for side in (split.off, split.on))
+                splits.append(Split(int(near[split.column]) if split.column >= 0 else -1, off, on, split.gain))
+            self.action = np.concatenate([self.action[kept], head.action])
+            self.value = np.concatenate([self.value[kept], head.value])
+            self.typical = np.concatenate([self.typical[kept], np.full(len(head.action), rates[context])])
+            self.closed = np.concatenate([self.closed[kept], np.zeros(len(head.action), dtype=np.bool_)])
+        if splits:
+            self.follow(splits)
+        return bool(splits)
+
+
+def _round(planes: PlaneTable, followed: Sequence[_Followed], most: int, certain: float) -> bool:
+    """Searches on in the contexts in which cells disagree; whether any split was found."""
+    tables = evidence_tables(max(int(each.n.max(initial=0)) for each in followed) + 1, certain)
+    opened = [np.flatnonzero(each.open_contexts(tables)) for each in followed]
+    limit = _water_level([np.minimum(f.e, f.n - f.e)[o] for f, o in zip(followed, opened, strict=True)], most // 4)
+    chosen: list[Ints] = []
+    searches: list[list[Search]] = []
+    for each, contexts in zip(followed, opened, strict=True):
+        searches.append(_sampled(each, contexts, limit, chosen))
+    every = [search for some in searches for search in some]
+    if not every:
+        return False
+    rows, cells = np.divmod(np.concatenate(chosen), planes.n_cells)
+    width = planes.board.width
+    table = values_at(planes.columns[planes.near], planes.every[0], planes.every_action, rows, cells // width, cells % width)
+    kinds = column_kinds(planes.columns)[planes.near]
+    tables = evidence_tables(len(table) + 1, certain)
+    go_on(every, table, columns_of(table), kinds, planes.acts.n_ways, tables, planes.in_pairs)
+    grown = [each.graft(some, contexts, planes.near) for each, some, contexts in zip(followed, searches, opened, strict=True)]
+    return any(grown)
+
+
+def _water_level(rarer: Sequence[Ints], room: int) -> int:
+    """How many cells of its rarer outcome a context may have, where there is room for so many in all."""
+    counts = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *rarer]))
+    below = np.concatenate([[0], np.cumsum(counts)])
+    for i, count in enumerate(counts):
+        if below[i] + count * (len(counts) - i) > room:
+            return max(1, int((room - below[i]) // (len(counts) - i)))
+    return room
+
+
+def _sampled(each: _Followed, contexts: Ints, limit: int, chosen: list[Ints]) -> list[Search]:
+    """A search of some cells of each of some contexts; the cells are added to ``chosen``, and their rows numbered as there.
+
+    Of the rarer outcome evenly chosen cells are taken, of the other three times as many and ``LEAST`` more. They all weigh the
+    same: that a column is on in none of the few that were taken says little of all that they stand for. What tells outcomes
+    apart can be learned from such cells, how often they come cannot; so each context is searched for itself.
+    """
+    number = np.full(len(each.action) + 1, -1, dtype=np.int32)  # the last one: of cells that are not asked
+    number[contexts] = np.arange(len(contexts))
+    inside = np.flatnonzero(number[each.context] >= 0)
+    group = 2 * number[each.context[inside]] + each.came()[inside]
+    order = np.argsort(group, kind="stable")
+    ends = np.searchsorted(group[order], np.arange(2 * len(contexts) + 1))
+    begun, searches = sum(len(cells) for cells in chosen), []
+    for k, context in enumerate(contexts):
+        outcomes = [inside[order[ends[2 * k + e] : ends[2 * k + e + 1]]] for e in (0, 1)]
+        rarer = min(limit, *(len(outcome) for outcome in outcomes))
+        sizes = [min(len(o), 3 * rarer + LEAST if len(o) == max(map(len, outcomes)) else rarer) for o in outcomes]
+        taken = [o[np.linspace(0, len(o) - 1, n).astype(np.int64)] for o, n in zip(outcomes, sizes, strict=True)]
+        chosen += taken
+        rows, came = begun + np.arange(sum(sizes)), np.repeat([0, 1], sizes)
+        begun += sum(sizes)
+        start = np.zeros(len(rows), dtype=np.int64)
+        own = slice(int(context), int(context) + 1)
+        searches.append(Search(Head(rows, start + 1, came, start, each.action[own], each.value[own])))
+    return searches
+
+
+@compiled
+def _walk(values: Bools, which: Ints, first: Ints, targets: Ints, context: NDArray[np.int32]) -> None:
+    """Takes cells through splits: ``context`` [n] is changed.
+
+    Args:
+        values: columns, bool [U, n].
+        which: the column of each split, int64 [S]; -1 for none.
+        first: where the targets of each split begin, int64 [S + 1].
+        targets: new context of each old one, where the column is off and on, int64 [2, sum of contexts].
+        context: int32 [n]; negative where there is none.
+    """
+    for cell in range(len(context)):
+        now = context[cell]
+        if now >= 0:
+            for s in range(len(which)):
+                side = 1 if which[s] >= 0 and values[which[s], cell] else 0
+                now = targets[side, first[s] + now]
+            context[cell] = now

@@ -1,0 +1,158 @@
+"""Rates of leaves, where some things are random and others certain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from mbagent.models.dbn.splits import Search
+from mbagent.types import Floats, Ints
+
+SURE = 0.02
+"""Typical rates are taken to lie this far from 0 and 1 at least."""
+
+WIDTH = 0.25
+"""Logits from one component of a mixture to the next, and each one's standard deviation."""
+
+CENTRES: Floats = special.expit(np.arange(-9.5, 9.5 + WIDTH, WIDTH))
+"""Mean rates of the components, which are Beta distributions."""
+
+UP, DOWN = 1.0 / WIDTH**2 / (1.0 - CENTRES), 1.0 / WIDTH**2 / CENTRES
+"""Their parameters."""
+
+MIXED_STRENGTH = 0.3
+"""Rows that the typical rate counts for beside a mixture."""
+
+ROUNDS = 60
+"""Rounds of expectation and maximisation."""
+
+LEAST = 1e-8
+"""Least weight of a rate in a mixture: nothing is impossible."""
+
+MOST_LEAVES = 20_000
+"""Leaves that a mixture is fitted to; of more, evenly chosen ones."""
+
+WORTHWHILE = 40.0
+"""Evidence, nats, that a fitted mixture must have beyond the best simple prior: its weights are not free."""
+
+
+@dataclass(frozen=True)
+class LeafPrior:
+    """What is believed of a leaf's rate before its rows are seen: a spike at 0 and 1, and a slab around the typical rate.
+
+    Attributes:
+        certain: probability that nothing about the leaf is random.
+        strength: rows that the typical rate counts for otherwise.
+    """
+
+    certain: float
+    strength: float
+
+    def evidence(self, n: Ints, e: Ints, typical: Floats) -> tuple[Floats, Floats]:
+        """Log-probability of ``e`` of ``n`` rows, in their order, and the posterior probability of the slab."""
+        return _with_spike(self._slab(n, e, typical)[0], self.certain, n, e, typical)
+
+    def rates(self, n: Ints, e: Ints, typical: Floats) -> Floats:
+        """Posterior mean rate."""
+        typical = typical.clip(SURE, 1.0 - SURE)
+        rows, mean = self._slab(n, e, typical)
+        _, slab = _with_spike(rows, self.certain, n, e, typical)
+        spike = np.where(n == 0, typical, (e == n) * 1.0)
+        result: Floats = slab * mean + (1.0 - slab) * spike
+        return result
+
+    def _slab(self, n: Ints, e: Ints, typical: Floats) -> tuple[Floats, Floats]:
+        """Log-probability of the rows and their mean rate where something is random."""
+        up, down = self.strength * typical, self.strength * (1.0 - typical)
+        return special.betaln(up + e, down + n - e) - special.betaln(up, down), (e + up) / (n + self.strength)
+
+
+@dataclass(frozen=True)
+class MixedPrior(LeafPrior):
+    """The slab has the shape that the rates of all leaves have: a world with few kinds of luck has few rates.
+
+    The distribution of the rates is the likeliest mixture of narrow Beta distributions (after Kiefer and Wolfowitz 1956, and
+    Laird 1978); the typical rate counts for ``strength`` rows beside it. With equal weights it is about the simple prior.
+
+    Attributes:
+        weights: of the components, see CENTRES.
+    """
+
+    weights: Floats
+
+    def _slab(self, n: Ints, e: Ints, typical: Floats) -> tuple[Floats, Floats]:
+        before = special.logsumexp(_likelihoods(0 * n, 0 * e, typical, self.strength), axis=1, b=self.weights)
+        after = _likelihoods(n, e, typical, self.strength) + np.log(self.weights)
+        total = special.logsumexp(after, axis=1)
+        seen = (n + self.strength)[:, None]
+        means = (UP + e[:, None] + self.strength * typical[:, None]) / (UP + DOWN + seen)
+        return total - before, (np.exp(after - total[:, None]) * means).sum(axis=1)
+
+
+def best_prior(searches: Sequence[Search]) -> LeafPrior:
+    """The simple prior under which the leaves found are likeliest."""
+    return _best_of(PRIORS, *_leaves(searches))
+
+
+def fitted_prior(searches: Sequence[Search]) -> LeafPrior:
+    """As ``best_prior``; a mixture fitted to the leaves where they clearly are likelier then."""
+    n, e, typical = _leaves(searches)
+    simple, met = _best_of(PRIORS, n, e, typical), np.flatnonzero(n)
+    if len(met) == 0:
+        return simple
+    some = met[np.linspace(0, len(met) - 1, min(len(met), MOST_LEAVES)).astype(np.int64)]
+    leaves = n[some], e[some], typical[some]
+    mixed = _mixture(simple.certain, *leaves)
+    gain = float((mixed.evidence(*leaves)[0] - simple.evidence(*leaves)[0]).sum())
+    return mixed if gain > WORTHWHILE else simple
+
+
+def _leaves(searches: Sequence[Search]) -> tuple[Ints, Ints, Floats]:
+    """Rows, arrivals and typical rate of all leaves."""
+    counts = [search.counts() for search in searches]
+    nothing = np.zeros(0, dtype=np.int64)
+    n, e = (np.concatenate([nothing, *(pair[i] for pair in counts)]) for i in (0, 1))
+    return n, e, np.concatenate([np.zeros(0), *(search.typical for search in searches)]).clip(SURE, 1.0 - SURE)
+
+
+def _best_of(priors: Sequence[LeafPrior], n: Ints, e: Ints, typical: Floats) -> LeafPrior:
+    return max(priors, key=lambda prior: float(prior.evidence(n, e, typical)[0].sum()))
+
+
+def _with_spike(slab: Floats, certain: float, n: Ints, e: Ints, typical: Floats) -> tuple[Floats, Floats]:
+    """Evidence of leaves whose evidence is ``slab`` if anything is random, and the posterior probability that it is."""
+    slab = slab + np.log1p(-certain)
+    with np.errstate(divide="ignore"):
+        spike = np.log(certain * ((e == 0) * (1.0 - typical) + (e == n) * typical))
+    total = np.logaddexp(slab, spike)
+    return total, np.exp(slab - total)
+
+
+def _likelihoods(n: Ints, e: Ints, typical: Floats, strength: float) -> Floats:
+    """Log-probability [N, K] of the leaves' rows, and of what the typical rate counts for, under each component."""
+    up, down = e + strength * typical, n - e + strength * (1.0 - typical)
+    result: Floats = special.betaln(UP + up[:, None], DOWN + down[:, None]) - special.betaln(UP, DOWN)
+    return result
+
+
+def _mixture(certain: float, n: Ints, e: Ints, typical: Floats) -> MixedPrior:
+    """The mixture under which leaves are likeliest, by expectation and maximisation from a simple prior on."""
+    rows, before = (_likelihoods(k * n, k * e, typical, MIXED_STRENGTH) for k in (1, 0))
+    top = rows.max(axis=1)
+    rows, before, weights = np.exp(rows - top[:, None]), np.exp(before), np.full(len(CENTRES), 1.0 / len(CENTRES))
+    for _ in range(ROUNDS):
+        after, given = rows @ weights, before @ weights
+        slab = _with_spike(np.log(after / given) + top, certain, n, e, typical)[1]
+        weights *= ((slab / after) @ rows) / np.maximum((slab / given) @ before, LEAST)
+        weights = np.maximum(weights / weights.sum(), LEAST)
+        certain = float(1.0 - slab.mean().clip(LEAST, 1.0 - LEAST))
+    return MixedPrior(certain, MIXED_STRENGTH, weights / weights.sum())
+
+
+PRIORS = tuple(
+    LeafPrior(certain, strength) for certain in (0.1, 0.5, 0.8, 0.9, 0.99, 0.999, 0.9999) for strength in (0.3, 1.0, 3.0, 10.0)
+)
+"""Simple priors to choose from."""

@@ -1,0 +1,387 @@
+"""A dynamic Bayesian network whose conditional distributions are decision graphs, learned from transitions."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.data import TransitionBatch, TransitionDataset
+from mbagent.models.base import FitReport
+from mbagent.models.dbn.arrays import Graphs, build, n_columns
+from mbagent.models.dbn.change_points import still_true_since
+from mbagent.models.dbn.effects import Asking, Partner, best_askings, candidates, likely_partners, more_folds
+from mbagent.models.dbn.features import Layout, acts_of, coupled_layout, is_lone_bit, lay_out
+from mbagent.models.dbn.fitting import AT_ONCE, Fitted, fit_graphs, flag_events, nothing_late
+from mbagent.models.dbn.mutex import find_groups
+from mbagent.models.dbn.predictions import GraphPredictions
+from mbagent.models.dbn.serialization import SAVED, from_arrays, table_of, to_arrays
+from mbagent.models.dbn.smoothing import habit_of
+from mbagent.models.fit_report import Variable, VariableReport, describe
+from mbagent.models.held_out import FORETOLD, SOME_ROWS, SOME_TESTS, better, thinned, within
+from mbagent.models.markov_test import steps_in_a_row, with_past
+from mbagent.spaces import FactoredSpace, PlaneLayout
+from mbagent.types import Bools, Floats
+
+
+def asked_columns(graphs: Graphs, unit: int) -> set[int]:
+    """Columns that the graphs of a unit ask for."""
+    if unit not in graphs.changing:
+        return set()
+    begin, end = graphs.entries[graphs.pairs[unit]], graphs.entries[graphs.pairs[unit + 1]]
+    stack, seen = [int(node) for node in graphs.nodes[begin:end]], set()
+    while stack:
+        node = stack.pop()
+        if node not in seen:
+            seen.add(node)
+            if graphs.column[node] >= 0:
+                stack += [int(graphs.off[node]), int(graphs.on[node])]
+    return {int(graphs.column[node]) for node in seen if graphs.column[node] >= 0}
+
+
+def hangs_on_action(graphs: Graphs, unit: int, layout: Layout) -> bool:
+    """Whether what a unit does differs from action to action."""
+    n, first = int(layout.outputs[unit]), int(graphs.pairs[unit])
+
+    def ways(pair: int) -> list[tuple[int, int]]:
+        entries = range(graphs.entries[first + pair], graphs.entries[first + pair + 1])
+        return [(int(graphs.values[e]), int(graphs.nodes[e])) for e in entries]
+
+    return any(ways(way * n + value) != ways(value) for value in range(n) for way in range(1, layout.acts.n_ways))
+
+
+def parent_factors(layout: Layout, columns: set[int]) -> set[int]:
+    """Factors that state columns are about; those of the next state are left out."""
+    return {int(layout.factor[column]) for column in columns if column < len(layout.factor)}
+
+
+def flat_variables(layout: Layout, graphs: Graphs, late: Graphs) -> list[Variable]:
+    """Factors and groups that have graphs, and what they hang on besides themselves."""
+    n, after, found = len(layout.factor), len(layout.factor) + layout.acts.n_columns, []
+    for unit in graphs.changing[graphs.changing < len(layout.outputs) - 2]:
+        factors = tuple(int(f) for f in layout.members[layout.first[unit] : layout.first[unit + 1]])
+        name = f"factor {factors[0]}" if len(factors) == 1 else f"factors {factors[0]}, {factors[1]}, …"
+        columns = asked_columns(graphs, int(unit)) | asked_columns(late, int(unit))
+        parents = [f"factor {f}" for f in sorted(parent_factors(layout, columns) - set(factors))]
+        if hangs_on_action(graphs, int(unit), layout) or any(n <= column < after for column in columns):
+            parents.insert(0, "action")
+        later = {int(layout.factor[column - after]) for column in columns if column >= after}
+        found.append(Variable(name, factors, (*parents, *(f"next factor {f}" for f in sorted(later)))))
+    return found
+
+
+IMPOSSIBLE = -200.0
+"""Log-probability that an impossible transition is charged with when models are compared."""
+
+FEWEST = 4
+"""Rare events that there must be to learn anything of them."""
+
+ENOUGH, MOST_SPLITS = 5, 10
+"""So many held-out rare events tell whether they are events at all; where one split has fewer, others follow, up to so many."""
+
+MOST_VALUES = 200_000_000
+"""Values of factors that are learned from at once, which takes up to some ten bytes each; of more transitions than have so
+many, evenly chosen ones are."""
+
+MOST_COUNTS = 20_000_000
+"""Contexts times columns of a question about how far a factor moves."""
+
+DESCRIBED = 2000
+"""Held-out transitions that figures of single variables are made from."""
+
+WORTH = 0.03
+"""What the past tells is worth telling beyond this share of what cannot be foretold, plus one nat."""
+
+
+class DecisionGraphModel(GraphPredictions):
+    """Each variable's next value by a small decision graph over the few columns that it hangs on.
+
+    Bits of which exactly one is on are drawn as one variable. Rare events that redraw almost everything have graphs of
+    their own, and one for whether they happen. Probabilities are exact, but that ``log_prob`` and ``marginals`` grant what never
+    changed a tiny probability to change, which draws leave out. A fit takes a second or a few, with very many values more.
+
+    Args:
+        cardinalities: number of values of each state factor, length F.
+        n_actions: number of enumerated actions A.
+        validation: share of episodes held out, for the report and for the choice whether there are rare events; the
+            graphs are fitted to all rows in the end.
+        parts: number of values of each part of an action, such as (2, 2, 2) for three switches, numbered as
+            ``ActionEnumeration`` does; each part is a cause for itself then. None: an action is one thing.
+
+    Raises:
+        ValueError: so many parts do not make so many actions.
+    """
+
+    def __init__(
+        self, cardinalities: tuple[int, ...], n_actions: int, validation: float = 0.1, parts: Sequence[int] | None = None
+    ) -> None:
+        """See the class."""
+        super().__init__(cardinalities, n_actions)
+        self.validation, self.parts = validation, (n_actions,) if parts is None else tuple(parts)
+        if math.prod(self.parts) != n_actions:
+            raise ValueError(f"Actions with {self.parts} values of their parts are {math.prod(self.parts)}, not {n_actions}.")
+        self.acts = acts_of(self.parts)
+        layout = lay_out(self.cardinalities, (), self.acts)
+        none = np.zeros(0, dtype=np.int64)
+        nothing = build(layout, (), (), [habit_of(int(n), self.acts.n_ways, none, none, none) for n in layout.outputs], 1e-9)
+        self.fitted = Fitted(layout, nothing, nothing_late(nothing), nothing, False, (), ())
+
+    def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
+        """See TransitionModel."""
+        began, n_met = time.perf_counter(), len(data)
+        data = within(data, MOST_VALUES)
+        rows, events = data.rows(), self._events(data, seed)
+        since = self._since(rows, events)
+        train, held_out, train_since = self._split(data, seed, since)
+        if progress is not None:
+            progress(0.4)
+        flagged = flag_events(train.before, train.after) & events.any()
+        manners = self._manners(train, flagged, held_out)
+        self.fitted = fit_graphs(self.cardinalities, self.acts, train, flagged, manners=manners, since=train_since)
+        likelihood, jointly = self._jointly(held_out)
+        if progress is not None:
+            progress(0.7)
+        exact, (variables, calibration) = self._exact_match(held_out), self._described(held_out)
+        self.fitted = fit_graphs(self.cardinalities, self.acts, rows, events, True, jointly, manners, since)
+        if progress is not None:
+            progress(1.0)
+        figures = {"nodes": float(len(self.fitted.usual.column)), "events": float(events.sum())}
+        figures |= {"changed": float((since > 0).sum()), "left out": float(n_met - len(rows))}
+        report = self._report((len(rows), len(held_out)), likelihood, exact, figures)
+        memory = self._memory(train, held_out)
+        report = replace(report, variables=variables, calibration=calibration, memory=memory)
+        return replace(report, seconds=time.perf_counter() - began)
+
+    def _since(self, rows: TransitionBatch, events: Bools) -> NDArray[np.int64]:
+        """First row that tells of each factor, and of ``terminated``, as it is now, int64 [F + 1]."""
+        usual, before = np.flatnonzero(~events), self._kept()
+        groups = find_groups(self.cardinalities, rows.states, rows.next_states, ~events)
+        variable = np.arange(len(self.cardinalities) + 1)
+        for group in groups:
+            variable[list(group)] = group[0]
+        variable = np.unique(variable, return_inverse=True)[1]
+        grouped = np.isin(np.arange(len(self.cardinalities)), [f for group in groups for f in group])
+
+        def foretell(train: TransitionBatch, tests: TransitionBatch) -> Floats:
+            logs = self._factors_foretold(train, tests)
+            logs[:, :-1][grouped & (tests.next_states == 0)] = 0.0  # a group's value is told by the bit that is on
+            return np.stack([logs[:, variable == v].sum(axis=1) for v in range(variable.max() + 1)], axis=1)
+
+        self.fitted = replace(self.fitted, has_event=False)
+        since = still_true_since(rows.select(usual), variable.max() + 1, foretell)
+        self._restore(before)
+        return np.where(since > 0, usual[since], 0)[variable]
+
+    def _split(
+        self, data: TransitionDataset, seed: int, since: NDArray[np.int64]
+    ) -> tuple[TransitionBatch, TransitionBatch, NDArray[np.int64]]:
+        """Training and held-out rows, and ``since`` among the former; what came before a change is not held out."""
+        rows, mask = data.rows(), data.held_out(self.validation, seed)
+        if not since.any():
+            return (*data.split(self.validation, seed), since)
+        new = np.arange(len(rows)) >= since.max()
+        mask &= new
+        if mask.sum() < new.sum() / 20:  # few long episodes: a run of steps instead
+            mask = new & (np.cumsum(new) > 0.9 * new.sum())
+        return rows.select(~mask), rows.select(mask), np.searchsorted(np.flatnonzero(~mask), since)
+
+    def _factors_foretold(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
+        """Log-probability of each factor's next value and of the end, [T, F + 1], after a quick look at other transitions."""
+        before = self._kept()
+        self._look(train)
+        probs, start = self.marginals(tests.states, tests.actions), np.concatenate([[0], np.cumsum(self.cardinalities)])
+        chosen = np.take_along_axis(probs, start[:-1] + tests.after, axis=1)
+        ends = [
+            self.log_prob(tests.states, tests.actions, tests.next_states, np.full(len(tests), over)) for over in (False, True)
+        ]
+        ends = [np.maximum(logs, -1e3) for logs in ends]  # an impossible state says nothing of the end
+        over = np.where(tests.terminated, ends[1], ends[0]) - np.logaddexp(*ends)
+        self._restore(before)
+        return np.concatenate([np.log(chosen.clip(1e-9)), over.clip(-20.0)[:, None]], axis=1)
+
+    def _described(self, held_out: TransitionBatch) -> tuple[tuple[VariableReport, ...], float | None]:
+        """Figures of each variable on some held-out transitions."""
+        some = thinned(held_out, DESCRIBED)
+        return describe(self.cardinalities, self.marginals(some.states, some.actions), some, self._variables())
+
+    def _variables(self) -> list[Variable]:
+        """What is reported of."""
+        return flat_variables(self.fitted.layout, self.fitted.usual, self.fitted.late)
+
+    def _memory(self, train: TransitionBatch, held_out: TransitionBatch) -> float | None:
+        """What the step before tells beyond the present, nats a transition; see FitReport."""
+        known, tests = steps_in_a_row(train, SOME_ROWS), steps_in_a_row(held_out, SOME_TESTS)
+        if min(len(known[0]), len(tests[0])) < 2:
+            return None
+        logs = self._foretold(known[0], tests[0])
+        if logs.mean() > FORETOLD:
+            return 0.0
+        space, longer = with_past(*known, self.cardinalities, self.acts, self._planes())
+        _, longer_tests = with_past(*tests, self.cardinalities, self.acts, self._planes())
+        further = self._with_memory(space)._foretold(longer, longer_tests)
+        gain = float((further - logs).mean())
+        return gain if better(further, logs) and gain > WORTH * (1.0 - logs.mean()) else 0.0
+
+    def _planes(self) -> PlaneLayout | None:
+        return None
+
+    def _with_memory(self, space: FactoredSpace) -> DecisionGraphModel:
+        return DecisionGraphModel(space.cardinalities, self.n_actions, parts=self.parts)
+
+    def _foretold(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
+        """Log-probabilities of transitions after a quick look at others; what was learned stays as it is."""
+        before = self._kept()
+        self._look(train)
+        logs = self.log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
+        self._restore(before)
+        return np.maximum(logs, IMPOSSIBLE)
+
+    def _look(self, rows: TransitionBatch) -> None:
+        """Learns quickly."""
+        events = flag_events(rows.before, rows.after) & self.fitted.has_event
+        self.fitted = fit_graphs(self.cardinalities, self.acts, rows, events, True, False)
+
+    def _kept(self) -> Any:
+        return self.fitted
+
+    def _restore(self, kept: Any) -> None:
+        self.fitted = kept
+
+    def _jointly(self, held_out: TransitionBatch) -> tuple[float, bool]:
+        """Held-out likelihood, and whether it is better for drawing some units late."""
+        likelihood = self._likelihood(self.fitted, held_out)
+        if len(self.fitted.late.changing) == 0 or len(held_out) == 0:
+            return likelihood, len(self.fitted.late.changing) > 0
+        apart = self._likelihood(replace(self.fitted, late=nothing_late(self.fitted.usual)), held_out)
+        return max(likelihood, apart), likelihood > apart
+
+    def _report(self, sizes: tuple[int, int], likelihood: float, exact: float, figures: Mapping[str, float]) -> FitReport:
+        """What a fit did; ``sizes`` are the rows fitted to and held out. Of nothing held out nothing is claimed."""
+        held_out = sizes[1] > 0
+        splits = [sum(split.column >= 0 for split in search.splits) for search in self.fitted.found]
+        return FitReport(
+            n_train=sizes[0],
+            n_validation=sizes[1],
+            epochs=1,
+            seconds=0.0,
+            predictor_loss=-likelihood if held_out else None,
+            exact_match=exact if held_out else None,
+            log={"questions": float(len(splits)), "splits": float(np.mean(splits)) if splits else 0.0, **figures},
+        )
+
+    def _events(self, data: TransitionDataset, seed: int) -> Bools:
+        """Which rows are rare events; none if held-out transitions are foretold better without."""
+        rows = data.rows()
+        events, gain, tested = flag_events(rows.before, rows.after), 0.0, 0
+        for split in range(MOST_SPLITS if events.sum() >= FEWEST else 0):
+            train, held_out = data.split(self.validation, seed + split)
+            seen = flag_events(train.before, train.after)
+            with_events, without = (
+                self._likelihood(fit_graphs(self.cardinalities, self.acts, train, flags, False, False), held_out)
+                for flags in (seen, np.zeros_like(seen))
+            )
+            gain += (with_events - without) * len(held_out)
+            tested += int(flag_events(held_out.before, held_out.after).sum())
+            if tested >= ENOUGH:
+                break
+        return events & (gain > 0.0)
+
+    def _manners(self, train: TransitionBatch, events: Bools, held_out: TransitionBatch) -> dict[int, Asking]:
+        """How each factor is asked about: as its held-out values are foretold best."""
+        n_contexts, n_columns = self.acts.n_ways * max(self.cardinalities, default=0), 2 * sum(self.cardinalities)
+        every = [f for f, cardinality in enumerate(self.cardinalities) if cardinality > 2]
+        if not every or n_contexts * n_columns > MOST_COUNTS or len(held_out) == 0:
+            return {}
+        folds = [(train, events, held_out)]
+        folds += [(train.select(~out), events[~out], train.select(out)) for out in more_folds(train, held_out)]
+
+        def foretold(askings: Sequence[Asking]) -> Floats:
+            named = dict(zip(every, askings, strict=True))
+            return np.concatenate([self._foretold_in(named, *fold) for fold in folds])
+
+        def partners() -> Sequence[tuple[Partner, int] | None]:
+            return likely_partners(every, candidates(self.cardinalities, self.parts), train.select(~events))
+
+        return dict(zip(every, best_askings(foretold, len(every), partners), strict=True))
+
+    def _foretold_in(
+        self, askings: Mapping[int, Asking], train: TransitionBatch, events: Bools, held_out: TransitionBatch
+    ) -> Floats:
+        """Log-probability of the held-out next values of K factors, [N, K], that are asked about so."""
+        self.fitted = fit_graphs(self.cardinalities, self.acts, train, events, False, False, askings)
+        start = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64)
+        probs, factors = self.marginals(held_out.states, held_out.actions), list(askings)
+        chosen = np.take_along_axis(probs, start[factors] + held_out.after[:, factors], axis=1)
+        logs: Floats = np.log(chosen.clip(1e-9))
+        return logs
+
+    def _likelihood(self, fitted: Fitted, rows: TransitionBatch) -> float:
+        """Mean log-probability of transitions; the impossible counts as ``IMPOSSIBLE``."""
+        before, self.fitted = self.fitted, fitted
+        parts = [self.log_prob(p.states, p.actions, p.next_states, p.terminated) for p in rows.parts(AT_ONCE)]
+        self.fitted, logs = before, np.concatenate([np.zeros(0), *parts])
+        return float(np.maximum(logs, IMPOSSIBLE).mean()) if len(logs) else 0.0
+
+    def _exact_match(self, rows: TransitionBatch) -> float:
+        hits = 0
+        for part in rows.parts(AT_ONCE):
+            states, terminated = self.likeliest(part.states, part.actions)
+            hits += int(((states == part.after).all(axis=1) & (terminated == part.terminated)).sum())
+        return hits / len(rows) if len(rows) else 1.0
+
+    def state_dict(self) -> dict[str, NDArray[Any]]:
+        """See TransitionModel."""
+        fitted = self.fitted
+        layout, grouped = fitted.layout, np.flatnonzero(np.diff(fitted.layout.first) > 1)
+        groups = [(int(unit), int(f)) for unit in grouped for f in layout.members[layout.first[unit] : layout.first[unit + 1]]]
+        state: dict[str, NDArray[Any]] = {
+            "groups": np.asarray(groups, dtype=np.int64).reshape(-1, 2),
+            "couplings": fitted.layout.coupling_of.copy(),
+            "has_event": np.asarray(fitted.has_event),
+        }
+        for name, graphs in (("usual", fitted.usual), ("late", fitted.late), ("event", fitted.event)):
+            state.update({f"{name}.{part}": array for part, array in to_arrays(graphs).items()})
+        return state
+
+    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """See TransitionModel.
+
+        Raises:
+            ValueError: the arrays are not those of a model of these factors and actions; nothing is changed then.
+        """
+        known = {
+            "groups",
+            "couplings",
+            "has_event",
+            *(f"{name}.{part}" for name in ("usual", "late", "event") for part in SAVED),
+        }
+        wrong = sorted(known ^ set(state))
+        if wrong:
+            raise ValueError(f"These weights are not those of a decision graph model (first difference: {wrong[0]!r}).")
+        pairs = table_of(state["groups"], 2)
+        groups = [tuple(int(f) for f in pairs[pairs[:, 0] == unit, 1]) for unit in np.unique(pairs[:, 0])]
+        members = pairs[:, 1]
+        bits = np.flatnonzero(np.asarray(self.cardinalities) == 2)
+        if len(np.unique(members)) < len(members) or not np.isin(members, bits).all() or any(len(g) < 2 for g in groups):
+            raise ValueError(
+                "These weights group other bits than this model has; load them into a model of the same environment."
+            )
+        layout = lay_out(self.cardinalities, groups, self.acts)
+        couplings = np.asarray(state["couplings"], dtype=np.int64).reshape(-1)
+        coupled = np.flatnonzero(couplings >= 0)
+        if len(couplings) != len(layout.outputs) or not is_lone_bit(layout)[coupled].all():
+            raise ValueError(
+                "These weights couple other bits than this model has; load them into a model of the same environment."
+            )
+        layout = coupled_layout(layout, [coupled[couplings[coupled] == q] for q in np.unique(couplings[coupled])])
+        now, both = n_columns(layout), n_columns(layout) + len(layout.factor)
+        usual, late, event = (
+            from_arrays({part: state[f"{name}.{part}"] for part in SAVED}, layout, n)
+            for name, n in (("usual", now), ("late", both), ("event", now))
+        )
+        self.fitted = Fitted(layout, usual, late, event, bool(np.any(state["has_event"])), (), ())

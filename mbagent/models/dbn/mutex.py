@@ -1,0 +1,177 @@
+"""Mutually exclusive bits: groups of which exactly one, or at most one, is on (Helmert 2009).
+
+Groups of which exactly one is on, such as a position encoded one-hot, are found from data and become one variable (paper section
+2.1), so that their bits are drawn jointly. Of bits of which at most one is on, each has a rate of its own, given by its graph;
+these rates are the probabilities of one draw among the bits and "none".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.data import Factors
+from mbagent.models.dbn.arrays import Graphs
+from mbagent.models.dbn.features import Layout
+from mbagent.models.systematic_sampling import NEGLIGIBLE
+from mbagent.types import Bools, Floats, Ints
+from mbagent_envs.jit import compiled
+
+EXPECTED = 8.0
+"""Two bits must have been expected together this often before "never" is believed: else it may be chance, one in 3,000."""
+
+MOST_ROWS = 50_000
+"""Rows that candidates are looked for in; what is found is checked on all."""
+
+
+def find_groups(
+    cardinalities: Sequence[int], states: Factors, next_states: Factors, usual: Bools | None = None
+) -> tuple[tuple[int, ...], ...]:
+    """Groups of bits of which exactly one is on in every state met.
+
+    Bits that were never on together, and that are often swapped (one goes out in the step in which the other comes
+    on), are gathered greedily, the most swapped first.
+
+    Args:
+        cardinalities: number of values of each factor, length F.
+        states: int [N, F].
+        next_states: int [N, F].
+        usual: bool [N], transitions to look for swaps in (rare events, which redraw all, swap anything); None: all.
+
+    Returns:
+        Factors of each group, ascending, three or more.
+    """
+    bits = np.flatnonzero(np.asarray(cardinalities) == 2)
+    if len(bits) < 3 or len(states) == 0:
+        return ()
+    some = np.linspace(0, len(states) - 1, min(len(states), MOST_ROWS)).astype(np.int64)
+    before, after = states[some][:, bits] == 1, next_states[some][:, bits] == 1
+    kept = slice(None) if usual is None else usual[some]
+    came, went = (after & ~before)[kept].astype(np.float32), (before & ~after)[kept].astype(np.float32)
+    swaps = went.T @ came
+    swaps += swaps.T
+    on = np.concatenate([before, after]).astype(np.float32)
+    exclusive = on.T @ on == 0
+    np.fill_diagonal(exclusive, False)
+    groups: list[tuple[int, ...]] = []
+    free = np.ones(len(bits), dtype=np.bool_)
+    while True:
+        found = _grow(np.where(exclusive & free[:, None] & free, swaps, 0.0), exclusive, free)
+        if len(found) < 2:
+            return tuple(sorted(groups))
+        group = np.sort(bits[found])
+        if len(group) > 2 and (states[:, group].sum(axis=1) == 1).all() and (next_states[:, group].sum(axis=1) == 1).all():
+            groups.append(tuple(int(f) for f in group))
+            free[found] = False
+        else:
+            free[found[0]] = False
+
+
+def find_cliques(together: NDArray[np.int64], expected: NDArray[np.float64]) -> list[NDArray[np.int64]]:
+    """Sets of bits of which no two were ever on together after a step though they should have been, were each for itself.
+
+    Args:
+        together: how often two bits were on together, int64 [n, n].
+        expected: how often they should have been by their own probabilities, [n, n].
+    """
+    never = (together == 0) & (expected > EXPECTED)
+    np.fill_diagonal(never, False)
+    strength, cliques = np.where(never, expected, 0.0), []
+    while strength.any():
+        found = np.sort(_grow(strength, never, never.any(axis=0)))
+        cliques.append(found)
+        never[found] = never[:, found] = False
+        strength[found] = strength[:, found] = 0.0
+    return cliques
+
+
+def _grow(swaps: NDArray[np.floating[Any]], exclusive: Bools, free: Bools) -> NDArray[np.int64]:
+    """The clique around the strongest swap, in the order found; nothing where there is no swap left."""
+    first, second = np.unravel_index(int(swaps.argmax()), swaps.shape)
+    if swaps[first, second] == 0:
+        return np.zeros(0, dtype=np.int64)
+    group = [int(first), int(second)]
+    candidates = exclusive[first] & exclusive[second] & free
+    strength = swaps[first] + swaps[second]
+    while candidates.any():
+        best = int(np.where(candidates, strength, -1.0).argmax())
+        if strength[best] <= 0:
+            break
+        group.append(best)
+        candidates &= exclusive[best]
+        strength = strength + swaps[best]
+    return np.asarray(group, dtype=np.int64)
+
+
+@compiled
+def widest(layout: Layout) -> int:
+    """Room that the distribution of any unit or coupling needs."""
+    room = layout.outputs.max()
+    for q in range(len(layout.exactly)):
+        room = max(room, layout.coupled_first[q + 1] - layout.coupled_first[q] + 1)
+    return int(room)
+
+
+@compiled
+def couple(coupling: int, state: Ints, rates: Floats, still: Bools, layout: Layout, graphs: Graphs, out: Floats) -> int:
+    """Writes the probability of each bit of a coupling, and of none, to ``out``; returns how many bits there are.
+
+    ``rates`` are all units' distributions; a bit that is ``still`` [U], without graphs, is as sure as it is in ``state``.
+    """
+    first, last = layout.coupled_first[coupling], layout.coupled_first[coupling + 1]
+    n, total = last - first, 0.0
+    for k in range(n):
+        unit = layout.coupled[first + k]
+        out[k] = state[layout.members[layout.first[unit]]] if still[unit] else rates[graphs.start[unit] + 1]
+        total += out[k]
+    none = 0.0 if layout.exactly[coupling] and total > 1e-9 else max(0.0, 1.0 - total)
+    for k in range(n):
+        out[k] /= total + none
+    out[n] = none / (total + none)
+    return int(n)
+
+
+@compiled
+def n_choices(coupling: int, state: Ints, rates: Floats, still: Bools, layout: Layout, graphs: Graphs) -> int:
+    """How many bits of a coupling may be on, and one more for none, unless a bit is sure to be on; at least 1."""
+    possible, sure = 0, False
+    for k in range(layout.coupled_first[coupling], layout.coupled_first[coupling + 1]):
+        unit = layout.coupled[k]
+        rate = float(state[layout.members[layout.first[unit]]]) if still[unit] else rates[graphs.start[unit] + 1]
+        possible += int(rate > 0.0)
+        sure |= rate >= 1.0
+    return possible + int(not sure)
+
+
+@compiled
+def leave_out_none(chances: Floats, n: int) -> None:
+    """Takes "none", the last of ``n`` chances, for an error of the bits' rates where it is negligible beside the likeliest."""
+    none, top = chances[n - 1], chances[:n].max()
+    if 0.0 < none < NEGLIGIBLE * top:
+        chances[n - 1] = 0.0
+        for k in range(n - 1):
+            chances[k] /= 1.0 - none
+
+
+@compiled
+def settle(state: Ints, coupling: int, chosen: int, layout: Layout) -> None:
+    """Switches the chosen bit of a coupling on and all others off; none where ``chosen`` is their number."""
+    first, last = layout.coupled_first[coupling], layout.coupled_first[coupling + 1]
+    for k in range(last - first):
+        state[layout.members[layout.first[layout.coupled[first + k]]]] = 1 if k == chosen else 0
+
+
+@compiled
+def which(state: Ints, coupling: int, layout: Layout) -> int:
+    """Which bit of a coupling is on; their number if none is, -1 if several are."""
+    first, last = layout.coupled_first[coupling], layout.coupled_first[coupling + 1]
+    found = last - first
+    for k in range(last - first):
+        if state[layout.members[layout.first[layout.coupled[first + k]]]] == 1:
+            if found < last - first:
+                return -1
+            found = k
+    return int(found)

@@ -1,0 +1,301 @@
+"""What a cell of a stack of planes can hang on: its neighbourhood, the border, the action, and what meets what anywhere.
+
+Columns are relative, the same for every position, so that what is learned at one position holds at all: modules that are
+alike share what they know (the paper's section 5). Shapes: N transitions, C channels, P positions, D relative columns.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.data import Factors
+from mbagent.models.dbn.features import BEYOND, act_columns
+from mbagent.types import Bools, Ints
+from mbagent_envs.jit import compiled
+
+_T = TypeVar("_T", bound=np.generic)
+
+CELL, BORDER, ACTION, MEETING, NEXT, WRAP, NEXT_MEETING = 0, 1, 2, 3, 4, 5, 6
+"""Kinds of relative columns, and what follows the kind:
+
+- CELL: channel, value, rows below, columns to the right;
+- BORDER: rows below, columns to the right;
+- ACTION: number of the column, and the actions that have it on: stride, n, value, see ``acts.act_columns``;
+- MEETING: channel, value, channel (``BEYOND``: what lies beyond the border), value, rows below, columns to the right; a value
+  with itself at no distance: whether it is anywhere;
+- NEXT, NEXT_MEETING: a CELL and a MEETING of the next state;
+- WRAP: a CELL that lies beyond the border, and so at the other end.
+"""
+
+
+class Reach(NamedTuple):
+    """How far a neighbourhood reaches.
+
+    Attributes:
+        radius: rows and columns in each direction.
+        wrap: whether it goes on at the other end of the board.
+    """
+
+    radius: int = 1
+    wrap: bool = False
+
+
+PIECE = 2000
+"""Cells whose neighbourhoods are looked at together."""
+
+NEXT_RADIUS = 2
+"""Rows and columns that a neighbourhood in the next state reaches: two places that a thing may go to lie so far apart."""
+
+
+def relative_columns(cardinalities: Sequence[int], parts: Sequence[int], reach: Reach) -> Ints:
+    """All relative columns, int64 [D, 7]; see above.
+
+    Args:
+        cardinalities: number of values of each channel's cells, length C.
+        parts: number of values of each part of an action.
+        reach: of neighbourhoods.
+    """
+    near = range(-reach.radius, reach.radius + 1)
+    offsets = list(itertools.product(near, near))
+    shown = [(c, v) for c, k in enumerate(cardinalities) for v in (range(k) if k != 2 else (1,))]
+    columns = [(CELL, c, v, dy, dx, 0, 0) for dy, dx in offsets for c, v in shown]
+    columns += [(BORDER, dy, dx, 0, 0, 0, 0) for dy, dx in offsets if (dy, dx) != (0, 0)]
+    columns += [(ACTION, number, *column, 0, 0) for number, column in enumerate(act_columns(parts))]
+    meetings = list(_meetings(shown))
+    columns += [(MEETING, *meeting) for meeting in meetings]
+    further = range(-NEXT_RADIUS, NEXT_RADIUS + 1)
+    columns += [(NEXT, c, v, dy, dx, 0, 0) for dy, dx in itertools.product(further, further) for c, v in shown]
+    columns += [(NEXT_MEETING, *meeting) for meeting in meetings]
+    if reach.wrap:
+        columns += [(WRAP, c, v, dy, dx, 0, 0) for dy, dx in offsets for c, v in shown if (dy, dx) != (0, 0)]
+    return np.asarray(columns, dtype=np.int64).reshape(-1, 7)
+
+
+def _meetings(shown: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int, int, int, int, int]]:
+    """Two things at one place or side by side, and a thing at one of the four sides."""
+    for i, first in enumerate(shown):
+        for second in shown[i:]:
+            for dy, dx in itertools.product((-1, 0, 1), (-1, 0, 1)):
+                if first != second or (dy, dx) >= (0, 0):
+                    yield (*first, *second, dy, dx)
+        for dy, dx in ((-1, 0), (0, 1), (1, 0), (0, -1)):
+            yield (*first, BEYOND, 0, dy, dx)
+
+
+def known_columns(columns: Ints, before: Factors, after: Factors) -> Ints:
+    """Numbers of the relative columns that may tell something, by what was met.
+
+    Values that never came tell nothing, nor do meetings of channels that only repeat another channel's past, or that are
+    the same all over the board; of the latter one cell tells all.
+
+    Args:
+        columns: int64 [D, 7].
+        before: planes, int [N, C, H, W].
+        after: those of the next states.
+    """
+    n_channels = before.shape[1]
+    now, then = ([_values(planes[:, channel]) for channel in range(n_channels)] for planes in (before, after))
+    even = {c for c in range(n_channels) if all((p[:, c] == p[:, c, :1, :1]).all() for p in (before, after))}
+    live = {BEYOND} | {
+        c
+        for c in range(n_channels)
+        if c not in even and not any(_repeats(after[:, c], before[:, other]) for other in range(n_channels) if other != c)
+    }
+
+    def known(kind: int, channel: int, value: int, other: int, second: int) -> bool:
+        came = then if kind in (NEXT, NEXT_MEETING) else now  # what ends an episode is never left again
+        if kind in (CELL, NEXT, WRAP):
+            return value in came[channel] and (channel not in even or (kind != WRAP and (other, second) == (0, 0)))
+        if kind not in (MEETING, NEXT_MEETING):
+            return True
+        return channel in live and other in live and value in came[channel] and (other == BEYOND or second in came[other])
+
+    return np.flatnonzero([known(*column[:5]) for column in columns.tolist()])
+
+
+def _values(plane: Factors) -> set[int]:
+    """Values of a plane [N, H, W]; they are few, and sorting all cells takes long."""
+    return {value for value in range(int(plane.max(initial=0)) + 1) if (plane == value).any()}
+
+
+def _repeats(after: Factors, before: Factors) -> bool:
+    some = slice(0, 100)
+    return bool((after[some] == before[some]).all() and (after == before).all())
+
+
+def told_by(channel: int, columns: Ints, numbers: Ints, before: Factors, after: Factors, actions: Ints) -> Ints | None:
+    """Numbers of the columns that alone tell what a channel becomes everywhere: another's present values, or an action.
+
+    Args:
+        channel: the channel.
+        columns: int64 [D, 7].
+        numbers: those that may be taken, int64 [K].
+        before: planes, int [N, C, H, W].
+        after: those of the next states.
+        actions: int64 [N].
+
+    Returns:
+        Numbers, or None where no other channel or action does.
+    """
+    here = numbers[(columns[numbers, 0] == CELL) & (columns[numbers, 3:5] == 0).all(axis=1)]
+    for other in np.unique(columns[here, 1]):
+        if other != channel and _repeats(after[:, channel], before[:, other]):
+            told: Ints = here[columns[here, 1] == other]
+            return told
+    for number in numbers[columns[numbers, 0] == ACTION]:
+        taken = _acts(columns[number], actions)[:, None, None]
+        if _repeats(after[:, channel], np.broadcast_to(taken, after[:, channel].shape).astype(after.dtype)):
+            return np.asarray([number])
+    return None
+
+
+def column_values(columns: Ints, planes: Factors, actions: Ints, after: Factors | None = None) -> Bools:
+    """Which columns are on for every transition and position, bool [N * P, D], positions of a transition together.
+
+    Args:
+        columns: relative columns, int64 [D, 7].
+        planes: int [N, C, H, W].
+        actions: int64 [N].
+        after: the next states' planes, for columns of the kind NEXT.
+    """
+    return np.ascontiguousarray(column_planes(columns, planes, actions, after).reshape(len(columns), -1).T)
+
+
+def column_planes(columns: Ints, planes: Factors, actions: Ints, after: Factors | None = None) -> Bools:
+    """As ``column_values``, one column after another, bool [D, N, H, W]."""
+    n, _, height, width = planes.shape
+    table = np.empty((len(columns), n, height, width), dtype=np.bool_)
+    inside = np.ones((height, width), dtype=np.bool_)
+    for d, (kind, *parts) in enumerate(columns.tolist()):
+        if kind == BORDER:
+            table[d] = ~shifted(inside[None], parts[0], parts[1])
+        elif kind == ACTION:
+            table[d] = _acts(columns[d], actions)[:, None, None]
+        elif kind in (MEETING, NEXT_MEETING):
+            table[d] = far_value(columns[d], planes, actions, after)[:, None, None]
+        else:
+            shown = _shown(kind, planes, after)[:, parts[0]] == parts[1]
+            table[d] = wrapped(shown, *parts[2:4]) if kind == WRAP else shifted(shown, *parts[2:4])
+    return table
+
+
+def values_at(columns: Ints, planes: Factors, actions: Ints, rows: Ints, y: Ints, x: Ints) -> Bools:
+    """As ``column_values``, of some positions of some transitions only, bool [K, D].
+
+    Args:
+        columns: relative columns of this state, int64 [D, 7].
+        planes: int [N, C, H, W].
+        actions: int64 [N].
+        rows: transition of each, int64 [K].
+        y: row of its position, int64 [K].
+        x: column of its position, int64 [K].
+    """
+    table = np.zeros((len(rows), len(columns)), dtype=np.bool_)
+    order = np.argsort(rows, kind="stable")
+    for begin in range(0, len(rows), PIECE):
+        some = order[begin : begin + PIECE]
+        met, where = np.unique(rows[some], return_inverse=True)
+        wide, part = planes[met].astype(np.int64), np.zeros((len(some), len(columns)), dtype=np.bool_)
+        _look_around(columns, wide, where, y[some], x[some], part)
+        for d in np.flatnonzero(np.isin(columns[:, 0], (ACTION, MEETING))):
+            part[:, d] = far_value(columns[d], wide, actions[met], None)[where]
+        table[some] = part
+    return table
+
+
+@compiled
+def _look_around(columns: Ints, planes: Ints, rows: Ints, y: Ints, x: Ints, out: Bools) -> None:
+    """The part of ``values_at`` that differs from position to position."""
+    _, _, height, width = planes.shape
+    for k in range(len(rows)):
+        for d in range(len(columns)):
+            kind = columns[d, 0]
+            if kind == BORDER:
+                row, column = y[k] + columns[d, 1], x[k] + columns[d, 2]
+                out[k, d] = not (0 <= row < height and 0 <= column < width)
+            elif kind in (CELL, WRAP):
+                row, column = y[k] + columns[d, 3], x[k] + columns[d, 4]
+                inside = 0 <= row < height and 0 <= column < width
+                if inside and kind == CELL:
+                    out[k, d] = planes[rows[k], columns[d, 1], row, column] == columns[d, 2]
+                elif not inside and kind == WRAP:
+                    out[k, d] = planes[rows[k], columns[d, 1], row % height, column % width] == columns[d, 2]
+
+
+def _shown(kind: int, planes: Factors, after: Factors | None) -> Factors:
+    if kind not in (NEXT, NEXT_MEETING):
+        return planes
+    assert after is not None
+    return after
+
+
+def _acts(column: Ints, actions: Ints) -> Bools:
+    """Whether each action [N] has a column on."""
+    on: Bools = actions // column[2] % column[3] == column[4]
+    return on
+
+
+def far_value(column: Ints, planes: Factors, actions: Ints, after: Factors | None) -> Bools:
+    """As ``column_values``, for a column that is the same at all positions, bool [N]."""
+    kind = int(column[0])
+    return _acts(column, actions) if kind == ACTION else meets(_shown(kind, planes, after), column[1:])
+
+
+def shifted(plane: NDArray[_T], below: int, right: int) -> NDArray[_T]:
+    """What lies so many rows below and columns to the right of each position of [N, H, W]; 0 beyond the border."""
+    _, height, width = plane.shape
+    result = np.zeros_like(plane)
+    rows, columns = slice(max(0, -below), min(height, height - below)), slice(max(0, -right), min(width, width - right))
+    source_rows = slice(max(0, below), min(height, height + below))
+    source_columns = slice(max(0, right), min(width, width + right))
+    result[:, rows, columns] = plane[:, source_rows, source_columns]
+    return result
+
+
+def wrapped(plane: NDArray[_T], below: int, right: int) -> NDArray[_T]:
+    """What lies beyond the border so far from each position of [N, H, W], and so at the other end; 0 where nothing is beyond."""
+    around = np.roll(plane, (-below, -right), axis=(1, 2))
+    inside = shifted(np.ones((1, *plane.shape[1:]), dtype=np.bool_), below, right)
+    return np.where(inside, np.zeros_like(around), around)
+
+
+def meets(planes: Factors, meeting: Ints) -> Bools:
+    """Whether, anywhere, one channel has a value and the other has its value so far from there, bool [N]."""
+    first, value, second, other, below, right = (int(part) for part in meeting)
+    inside = np.ones((1, *planes.shape[2:]), dtype=np.bool_)
+    there = ~shifted(inside, below, right) if second == BEYOND else shifted(planes[:, second] == other, below, right)
+    found: Bools = ((planes[:, first] == value) & there).any(axis=(1, 2))
+    return found
+
+
+def column_kinds(columns: Ints) -> Ints:
+    """Which kind of thing each relative column is, int64 [D]: a channel's cells (now, next), border, action, meeting."""
+    kind = columns[:, 0]
+    n_channels = int(columns[kind == CELL, 1].max(initial=0)) + 1
+    of_channel = np.isin(kind, (CELL, NEXT, WRAP))
+    kinds = np.where(of_channel, columns[:, 1] + n_channels * (kind == NEXT), 2 * n_channels + kind)
+    return kinds.astype(np.int64)
+
+
+def named_column(column: Ints) -> str:
+    """A relative column in words."""
+    kind, *parts = (int(part) for part in column)
+    if kind == ACTION:
+        return (
+            f"action {parts[3]}" if parts[1] == 1 and parts[0] == parts[3] else f"action // {parts[1]} % {parts[2]} = {parts[3]}"
+        )
+    if kind == BORDER:
+        return f"border at ({parts[0]:+d}, {parts[1]:+d})"
+    if kind in (MEETING, NEXT_MEETING):
+        other = "the border" if parts[2] == BEYOND else f"channel {parts[2]} = {parts[3]}"
+        words = f"channel {parts[0]} = {parts[1]} anywhere"
+        words += "" if parts[:2] == parts[2:4] and parts[4:] == [0, 0] else f" with {other} at ({parts[4]:+d}, {parts[5]:+d})"
+    else:
+        words = f"channel {parts[0]} = {parts[1]} at ({parts[2]:+d}, {parts[3]:+d})"
+        words += " around the board" if kind == WRAP else ""
+    return f"next {words}" if kind in (NEXT, NEXT_MEETING) else words

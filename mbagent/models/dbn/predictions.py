@@ -1,0 +1,168 @@
+"""What decision graphs foretell: draws, probabilities and successors, all exact."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mbagent.models.base import BaseTransitionModel
+from mbagent.models.dbn import sampling
+from mbagent.models.dbn.affected_variables import Lean
+from mbagent.models.dbn.arrays import Graphs
+from mbagent.models.dbn.fitting import Fitted, for_planning, nothing_late
+from mbagent.models.dbn.invariants import COVERING, MOST_TRIES, Laws, all_kept, kept_chances, lawful
+from mbagent.models.dbn.successors import WholeKernel, event_draws, kernel_of, mixed, successors
+from mbagent.models.protocol import Successors, as_keys
+from mbagent.models.systematic_sampling import assemble, rows_at_once, start
+from mbagent.types import Actions, Bools, Floats, Ints, Keys, Randomness, States
+from mbagent_envs.random_keys import derive, uniforms
+
+_EVENT = 1 << 33
+"""Salt of the random number that decides whether the event happens."""
+
+_AGAIN = 1 << 34
+"""Salt of the random numbers of the first repeated draw."""
+
+
+class GraphPredictions(BaseTransitionModel):
+    """The part of a model that reads graphs, however they were found.
+
+    Attributes:
+        fitted: the graphs.
+    """
+
+    fitted: Fitted
+    _planned: tuple[Fitted, Fitted] | None = None
+    _kernel: tuple[Fitted, Lean | WholeKernel] | None = None
+
+    def kernel(self) -> Lean | WholeKernel:
+        """The graphs for compiled search, see ``compiled_model.py``."""
+        if self._kernel is None or self._kernel[0] is not self.fitted:
+            self._kernel = self.fitted, kernel_of(self._for_planning(), self.cardinalities)
+        return self._kernel[1]
+
+    def _for_planning(self) -> Fitted:
+        if self._planned is None or self._planned[0] is not self.fitted:
+            self._planned = self.fitted, for_planning(self.fitted)
+        return self._planned[1]
+
+    @property
+    def _laws(self) -> Laws:
+        return Laws(self.fitted.layout.counts, self.fitted.layout.met)
+
+    @property
+    def _cells(self) -> tuple[Ints, Ints]:
+        """What the laws are about: see ``laws.keeps``."""
+        return self.fitted.layout.weights, self.fitted.layout.cells
+
+    def _rows(self, states: States, actions: Actions) -> tuple[States, Actions]:
+        states, actions = np.ascontiguousarray(states, dtype=np.int64), np.ascontiguousarray(actions, dtype=np.int64)
+        if states.ndim != 2 or states.shape[1] != len(self.cardinalities) or actions.shape != (len(states),):
+            raise ValueError(
+                f"A model of {len(self.cardinalities)} factors needs states [B, {len(self.cardinalities)}] and actions [B], "
+                f"got shapes {states.shape} and {actions.shape}."
+            )
+        return states, actions
+
+    def _event_rates(self, states: States, actions: Actions) -> Floats:
+        if not self.fitted.has_event:
+            return np.zeros(len(states))
+        rates: Floats = sampling.event_rates(states, actions, self.fitted.layout, self.fitted.usual)
+        return rates
+
+    def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
+        """See TransitionModel."""
+        states, actions = self._rows(states, actions)
+        keys = as_keys(rng, len(states))
+        following, over = self._draw(states, actions, keys)
+        for again in range(0 if self._laws.none else MOST_TRIES):
+            wrong = np.flatnonzero(~over & ~all_kept(*self._laws, *self._cells, states, following))
+            if len(wrong) == 0:
+                break
+            redrawn, ends = self._draw(states[wrong], actions[wrong], derive(keys[wrong], _AGAIN + again))
+            following[wrong[~ends]] = redrawn[~ends]  # whether the episode ends is drawn once
+        return following, over
+
+    def _draw(self, states: States, actions: Actions, keys: Keys, greedy: bool = False) -> tuple[States, Bools]:
+        """Draws by keys, or takes the likeliest value of each unit."""
+        fitted, following, over = self.fitted, states.copy(), np.zeros(len(states), dtype=np.bool_)
+        sampling.sample(states, actions, keys, greedy, fitted.layout, fitted.usual, fitted.late, following, over)
+        luck = 0.5 if greedy else uniforms(derive(keys, _EVENT), 1)[:, 0]
+        happens = np.flatnonzero(luck < self._event_rates(states, actions))
+        if len(happens):
+            given, event = states[happens], fitted.event
+            redrawn, ends = given.copy(), np.zeros(len(happens), dtype=np.bool_)
+            late = nothing_late(event)
+            sampling.sample(given, actions[happens], keys[happens], greedy, fitted.layout, event, late, redrawn, ends)
+            following[happens], over[happens] = redrawn, ends
+        return following, over
+
+    def likeliest(self, states: States, actions: Actions) -> tuple[States, Bools]:
+        """The likeliest next states, unit by unit, int64 [B, F], and whether they end the episode, bool [B]."""
+        states, actions = self._rows(states, actions)
+        return self._draw(states, actions, np.zeros(len(states), dtype=np.uint64), greedy=True)
+
+    def marginals(self, states: States, actions: Actions) -> Floats:
+        """See TransitionModel; of a factor that is drawn after others, given what these become, as learned of it by itself."""
+        states, actions = self._rows(states, actions)
+        start = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64)
+        fitted, probs = self.fitted, np.empty((len(states), int(start[-1])))
+        sampling.marginals(states, actions, fitted.layout, fitted.usual, start, probs)
+        if fitted.has_event:
+            rate, redrawn = self._event_rates(states, actions)[:, None], np.empty_like(probs)
+            sampling.marginals(states, actions, fitted.layout, fitted.event, start, redrawn)
+            probs += rate * (redrawn - probs)
+        return probs
+
+    def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
+        """See TransitionModel; exact for the distribution that ``sample`` draws from.
+
+        Where there are laws (see ``laws.py``), the chance that all are kept is estimated from systematic draws.
+        """
+        states, actions = self._rows(states, actions)
+        following, over = np.ascontiguousarray(next_states, dtype=np.int64), np.ascontiguousarray(terminated, dtype=np.bool_)
+        layout = self.fitted.layout
+        usual: Floats = sampling.log_prob(states, actions, following, over, layout, self.fitted.usual, self.fitted.late)
+        if not self._laws.none:
+            planned = self._for_planning()
+            found = self._successors(states, actions, planned.usual, planned.late, COVERING, 0)
+            kept = all_kept(*self._laws, *self._cells, states, following)
+            chances = kept_chances(self._laws, *self._cells, states, found)
+            usual[~over] = np.where(kept, usual - np.log(chances), -np.inf)[~over]
+        if not self.fitted.has_event:
+            return usual
+        rate = self._event_rates(states, actions)
+        event = sampling.log_prob(states, actions, following, over, layout, self.fitted.event, nothing_late(self.fitted.event))
+        with np.errstate(divide="ignore"):
+            return np.logaddexp(np.log1p(-rate) + usual, np.log(rate) + event)
+
+    def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
+        """See TransitionModel; see ``models/particles.py``."""
+        states, actions = self._rows(states, actions)
+        planned = self._for_planning()
+        if not self.fitted.has_event:
+            usual = self._successors(states, actions, planned.usual, planned.late, n_samples, seed)
+            return lawful(self._laws, *self._cells, states, usual)
+        rates: Floats = sampling.event_rates(states, actions, planned.layout, planned.usual)
+        n_events = np.array([event_draws(rate, n_samples) for rate in rates], dtype=np.int64)
+        parts, late = [], nothing_late(planned.event)
+        for n in np.unique(n_events):
+            some = np.flatnonzero((n_events == n) & (rates < 1.0))
+            found = self._successors(states[some], actions[some], planned.usual, planned.late, max(1, n_samples - int(n)), seed)
+            parts.append((some, 1.0 - rates[some], found))
+            if n > 0:
+                some = np.flatnonzero(n_events == n)
+                found = self._successors(states[some], actions[some], planned.event, late, int(n), seed)
+                parts.append((some, rates[some], found))
+        return mixed(parts, len(states))
+
+    def _successors(
+        self, states: States, actions: Actions, graphs: Graphs, late: Graphs, n_samples: int, seed: int
+    ) -> Successors:
+        key, offset = start(seed)
+        layout, n_outputs = self.fitted.layout, states.shape[1] + 1
+        step = rows_at_once(n_samples, n_outputs)
+        parts = [
+            successors(states[b : b + step], actions[b : b + step], layout, graphs, late, (n_samples, key, offset))
+            for b in range(0, len(states), step)
+        ]
+        return assemble(parts, n_outputs)

@@ -1,0 +1,290 @@
+"""Which class a whole transition is of, such as which reward it earned, by decision graphs over all that it shows.
+
+Each class but the commonest has a graph of its own for whether a transition is of it. Graphs ask for the values of single factors
+before and after the step, for the action, and, on planes, for what meets what anywhere. Columns are looked at only when a
+graph asks for them. Shapes: B rows, F factors, C channels, D columns, J graphs, K classes, W ways of actions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.data import TransitionBatch
+from mbagent.models.dbn.arrays import Nodes, meets
+from mbagent.models.dbn.features import Layout, Seen, acts_of, ask, column_kinds, distinct, lay_out, shown_acts
+from mbagent.models.dbn.leaf_prior import best_prior
+from mbagent.models.dbn.plane_features import MEETING, NEXT_MEETING, Reach, far_value, known_columns, relative_columns
+from mbagent.models.dbn.split_search import find_splits
+from mbagent.spaces import PlaneLayout
+from mbagent.types import Bools, Floats, Ints
+from mbagent_envs.jit import compiled, inlined
+
+SHOWN, NEXT_SHOWN, ACT, MEETS, NEXT_MEETS = range(5)
+"""Kinds of columns: a factor's value lies from one to another, now or next; an action has it; see ``units.Layout.meetings``."""
+
+MOST_ENTRIES = 50_000_000
+"""Rows times columns that are searched; of more rows, all of rare classes and evenly chosen others are, up to half each."""
+
+MOST_SINGLE = 4000
+"""On planes with more columns of single cells than that, only what meets what is asked for."""
+
+
+class ClassGraphs(NamedTuple):
+    """The graphs, as arrays.
+
+    Attributes:
+        columns: kind and up to six parts, int64 [D, 7].
+        cells: factor of each channel's cells, int64 [C, H, W]; empty without planes.
+        ways: the number under which each action is counted, int64 [A].
+        acts: which action columns are on, bool [A, columns].
+        classes: class of each graph, int64 [J].
+        first: first node of each graph and way, -1 where the class never came under it, int64 [J, W].
+        node: column (-1 at a leaf), and the next node where it is off and on, int64 [nodes, 3]; those come before.
+        rate: probability of the class at a leaf, [nodes].
+    """
+
+    columns: Ints
+    cells: Ints
+    ways: Ints
+    acts: Bools
+    classes: Ints
+    first: Ints
+    node: Ints
+    rate: Floats
+
+
+def learn_classes(
+    rows: TransitionBatch, classes: Ints, cardinalities: Sequence[int], parts: Sequence[int], planes: PlaneLayout | None
+) -> ClassGraphs:
+    """Learns what the class of a transition hangs on.
+
+    Args:
+        rows: N transitions.
+        classes: class of each, int64 [N]; 0 is the commonest.
+        cardinalities: number of values of each factor, length F.
+        parts: number of values of each part of an action.
+        planes: where cells lie, where factors form planes.
+    """
+    acts, layout = acts_of(parts), lay_out(cardinalities, (), acts_of(parts), ordinal=planes is None)
+    candidates = _candidates(rows, layout, cardinalities, parts, planes)
+    chosen = _chosen(classes, max(1, MOST_ENTRIES // max(len(candidates), 1)))
+    some, kinds = rows.select(chosen), _kinds(rows, layout, candidates)
+    first, pattern = distinct(np.packbits(_values(some, layout, candidates, planes), axis=1), some.actions)
+    table = _values(some.select(first), layout, candidates, planes)
+    nothing, nodes = np.zeros(len(some), dtype=np.int64), Nodes()
+    present = [int(k) for k in np.unique(classes) if k > 0]
+    asked = [
+        ask(0, 2, Seen(pattern, acts.way[some.actions], nothing, (classes[chosen] == k).astype(np.int64)))[0] for k in present
+    ]
+    found = find_splits([question.head for question in asked], table, kinds, acts.n_ways)
+    begins = np.full((len(asked), acts.n_ways), -1, dtype=np.int64)
+    for j, (question, search) in enumerate(zip(asked, found, strict=True)):
+        begins[j, question.pairs // 2] = nodes.graph(search, best_prior(found))
+    links = np.asarray(nodes.links, dtype=np.int64).reshape(-1, 3)
+    used, number = np.unique(links[:, 0][links[:, 0] >= 0], return_inverse=True)
+    links[links[:, 0] >= 0, 0] = number
+    switches, cells = shown_acts(acts, np.arange(len(acts.way))), cells_in(planes, len(cardinalities))
+    graphs = ClassGraphs(candidates[used], cells, acts.way, switches, np.asarray(present), begins, links, _rates(nodes))
+    return graphs._replace(rate=_counted(graphs, rows, classes))
+
+
+def cells_in(planes: PlaneLayout | None, n_factors: int) -> Ints:
+    """Factor of each channel's cells, int64 [C, H, W]; empty without planes."""
+    if planes is None:
+        return np.zeros((0, 0, 0), dtype=np.int64)
+    cells: Ints = np.ascontiguousarray(planes.to_planes(np.arange(n_factors)[None])[0], dtype=np.int64)
+    return cells
+
+
+def _rates(nodes: Nodes) -> Floats:
+    rates: Floats = np.asarray(nodes.rates, dtype=np.float64).reshape(-1, 2)[:, 0]
+    return np.ascontiguousarray(rates)
+
+
+def _chosen(classes: Ints, most: int) -> Ints:
+    """Numbers of the rows that are searched."""
+    if len(classes) <= most:
+        return np.arange(len(classes))
+    rare, common = np.flatnonzero(classes > 0), np.flatnonzero(classes == 0)
+    n_rare = min(len(rare), most // 2)
+    picked = [group[np.linspace(0, len(group) - 1, n).astype(np.int64)] for group, n in ((rare, n_rare), (common, most - n_rare))]
+    chosen: Ints = np.unique(np.concatenate(picked))
+    return chosen
+
+
+def _candidates(
+    rows: TransitionBatch, layout: Layout, cardinalities: Sequence[int], parts: Sequence[int], planes: PlaneLayout | None
+) -> Ints:
+    """Columns that may tell something, int64 [D, 7]."""
+    single = np.zeros((len(layout.factor), 7), dtype=np.int64)
+    single[:, 1:4] = np.stack([layout.factor, layout.value, layout.top], axis=1)
+    acts = np.zeros((layout.acts.n_columns, 7), dtype=np.int64)
+    acts[:, 0], acts[:, 1] = ACT, np.arange(layout.acts.n_columns)
+    following = single.copy()
+    following[:, 0] = NEXT_SHOWN
+    told = [_varying(single, rows.before), _varying(following, rows.after)]
+    if planes is None:
+        return np.concatenate([*told, acts])
+    each = planes.to_planes(np.asarray(cardinalities)[None])[0]
+    relative = relative_columns(tuple(int(k) for k in each[:, 0, 0]), parts, Reach())
+    relative = relative[known_columns(relative, planes.to_planes(rows.before), planes.to_planes(rows.after))]
+    meetings = relative[np.isin(relative[:, 0], (MEETING, NEXT_MEETING))]
+    meetings[:, 0] = np.where(meetings[:, 0] == MEETING, MEETS, NEXT_MEETS)
+    told = told if sum(map(len, told)) <= MOST_SINGLE else []
+    return np.concatenate([*told, acts, meetings])
+
+
+def _varying(columns: Ints, states: NDArray[Any]) -> Ints:
+    """Those columns whose factor is not the same everywhere."""
+    varies = (states != states[:1]).any(axis=0)
+    told: Ints = columns[varies[columns[:, 1]]]
+    return told
+
+
+def _kinds(rows: TransitionBatch, layout: Layout, candidates: Ints) -> Ints:
+    """Kind of each column: causes of one kind make others of that kind likelier, see ``find_splits``."""
+    of_single = column_kinds(layout, rows.before, (rows.before != rows.after).any(axis=0))
+    number = {tuple(key): i for i, key in enumerate(np.stack([layout.factor, layout.value, layout.top], axis=1).tolist())}
+    most, kinds = int(of_single.max(initial=0)) + 1, np.empty(len(candidates), dtype=np.int64)
+    for d, (kind, *parts) in enumerate(candidates.tolist()):
+        own = int(of_single[number[tuple(parts[:3])]]) if kind in (SHOWN, NEXT_SHOWN) else 0
+        kinds[d] = own + most * (1 + kind) if kind != SHOWN else own
+    return kinds
+
+
+def _values(rows: TransitionBatch, layout: Layout, candidates: Ints, planes: PlaneLayout | None) -> Bools:
+    """Which columns are on, bool [N, D]."""
+    table, kind = np.empty((len(rows), len(candidates)), dtype=np.bool_), candidates[:, 0]
+    for which, states in ((SHOWN, rows.before), (NEXT_SHOWN, rows.after)):
+        here = np.flatnonzero(kind == which)
+        values = states[:, candidates[here, 1]]
+        table[:, here] = (values >= candidates[here, 2]) & (values <= candidates[here, 3])
+    table[:, kind == ACT] = shown_acts(layout.acts, rows.actions)
+    if planes is not None:
+        before, after = planes.to_planes(rows.before), planes.to_planes(rows.after)
+        for d in np.flatnonzero(np.isin(kind, (MEETS, NEXT_MEETS))):
+            column = candidates[d].copy()
+            column[0] = MEETING if kind[d] == MEETS else NEXT_MEETING
+            table[:, d] = far_value(column, before, rows.actions, after)
+    return table
+
+
+def _counted(graphs: ClassGraphs, rows: TransitionBatch, classes: Ints) -> Floats:
+    """Rates at the leaves as they are over all rows, whichever were searched."""
+    rates = graphs.rate.copy()
+    for j, k in enumerate(graphs.classes):
+        parts = [leaves_of(graphs, j, part.states, part.actions, part.next_states) for part in rows.parts(10_000)]
+        leaves = np.concatenate(parts)
+        met = leaves >= 0
+        n, e = (np.bincount(leaves[met], weights=which[met], minlength=len(rates)) for which in (classes >= 0, classes == k))
+        rates = np.where(n > 0, e / np.maximum(n, 1), rates)
+    return rates
+
+
+@inlined
+def _leaf(
+    node: int,
+    state: Ints,
+    action: int,
+    following: Ints,
+    columns: Ints,
+    cells: Ints,
+    acts: Bools,
+    nodes: Ints,
+) -> int:
+    """The leaf that a transition leads to from a node on, or -1. Takes arrays: to have them from a tuple each time costs more."""
+    while node >= 0 and nodes[node, 0] >= 0:
+        column = nodes[node, 0]
+        kind = columns[column, 0]
+        if kind == ACT:
+            on = acts[action, columns[column, 1]]
+        elif kind == SHOWN:
+            on = columns[column, 2] <= state[columns[column, 1]] <= columns[column, 3]
+        elif kind == NEXT_SHOWN:
+            on = columns[column, 2] <= following[columns[column, 1]] <= columns[column, 3]
+        elif kind == MEETS:
+            on = meets(state, cells, columns[column, 1:])
+        else:
+            on = meets(following, cells, columns[column, 1:])
+        node = nodes[node, 2] if on else nodes[node, 1]
+    return int(node)
+
+
+@compiled
+def leaves_of(graphs: ClassGraphs, j: int, states: Ints, actions: Ints, following: Ints) -> Ints:
+    """Leaves of graph ``j`` that transitions [B] lead to, -1 for none."""
+    columns, cells, acts, nodes = graphs.columns, graphs.cells, graphs.acts, graphs.node
+    first, ways, result = graphs.first, graphs.ways, np.empty(len(actions), dtype=np.int64)
+    for b in range(len(actions)):
+        result[b] = _leaf(first[j, ways[actions[b]]], states[b], actions[b], following[b], columns, cells, acts, nodes)
+    return result
+
+
+@compiled
+def class_chances(graphs: ClassGraphs, n_classes: int, states: Ints, actions: Ints, following: Ints) -> Floats:
+    """Probability of each class of transitions [B, F], [B, K]; what graphs leave over is that of class 0."""
+    columns, cells, acts, nodes = graphs.columns, graphs.cells, graphs.acts, graphs.node
+    first, ways, classes, rate = graphs.first, graphs.ways, graphs.classes, graphs.rate
+    result = np.zeros((len(actions), n_classes), dtype=np.float64)
+    for b in range(len(actions)):
+        total, way = 0.0, ways[actions[b]]
+        for j in range(len(classes)):
+            leaf = _leaf(first[j, way], states[b], actions[b], following[b], columns, cells, acts, nodes)
+            if leaf >= 0:
+                result[b, classes[j]] = rate[leaf]
+                total += rate[leaf]
+        if total > 1.0:
+            for k in range(n_classes):
+                result[b, k] /= total
+        result[b, 0] = max(0.0, 1.0 - total)
+    return result
+
+
+def check_graphs(
+    state: Mapping[str, NDArray[Any]], cardinalities: Sequence[int], n_actions: int, n_classes: int, cells: Ints
+) -> ClassGraphs:
+    """The graphs that arrays from a file stand for.
+
+    Raises:
+        ValueError: they are not those of graphs of these factors, actions and classes.
+    """
+    wrong = "These weights are not those of a learned reward of this environment; the file is damaged, or of another one."
+    if set(state) != set(ClassGraphs._fields):
+        raise ValueError(wrong)
+    kinds = {"acts": np.bool_, "rate": np.float64}
+    g = ClassGraphs(*(np.ascontiguousarray(state[name], dtype=kinds.get(name, np.int64)) for name in ClassGraphs._fields))
+    shapes = (g.columns.ndim, g.acts.ndim, g.first.ndim, g.node.ndim, g.ways.ndim, g.classes.ndim, g.rate.ndim)
+    if shapes != (2, 2, 2, 2, 1, 1, 1) or g.columns.shape[1] != 7 or g.node.shape[1] != 3 or len(g.rate) != len(g.node):
+        raise ValueError(wrong)
+    kind, parts = g.columns[:, 0], g.columns[:, 1:]
+    single, meeting = np.isin(kind, (SHOWN, NEXT_SHOWN)), np.isin(kind, (MEETS, NEXT_MEETS))
+    inner, n = g.node[:, 0] >= 0, np.arange(len(g.node))
+    sound = (
+        g.cells.shape == cells.shape
+        and (g.cells == cells).all()
+        and len(g.ways) == len(g.acts) == n_actions
+        and _within(g.ways, 0, g.first.shape[1])
+        and _within(g.classes, 1, n_classes)
+        and len(g.first) == len(g.classes)
+        and _within(g.first, -1, len(g.node))
+        and _within(g.node[:, 0], -1, len(g.columns))
+        and all(_within(g.node[inner, i], 0, len(g.node)) and (g.node[inner, i] < n[inner]).all() for i in (1, 2))
+        and _within(kind, SHOWN, NEXT_MEETS + 1)
+        and _within(parts[single, 0], 0, len(cardinalities))
+        and _within(parts[kind == ACT, 0], 0, g.acts.shape[1])
+        and _within(parts[meeting, 0], 0, len(cells))
+        and _within(parts[meeting, 2], -1, len(cells))
+        and bool((np.abs(parts[meeting, 4:6]) <= 1).all())
+        and bool(((g.rate >= 0.0) & (g.rate <= 1.0)).all())
+    )
+    if not sound:
+        raise ValueError(wrong)
+    return g
+
+
+def _within(numbers: Ints, low: int, high: int) -> bool:
+    return bool(((numbers >= low) & (numbers < high)).all())

@@ -1,0 +1,280 @@
+"""Drawing from decision graphs, compiled: next states and probabilities.
+
+Units that ``late`` has graphs of are drawn after all others, given what those became (the paper's conditioner, section 3.2);
+only in rows where they are uncertain by themselves, but for whether the episode ended. Shapes: B batch, F factors, U units
+(the last two are ``terminated`` and the event), Q couplings, D columns, D' of them the state's.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from mbagent.models.dbn.arrays import Graphs, distributions, n_columns, read, show, show_next, show_next_meetings, write
+from mbagent.models.dbn.features import Layout
+from mbagent.models.dbn.mutex import couple, settle, which, widest
+from mbagent.models.systematic_sampling import NEGLIGIBLE
+from mbagent.types import Bools, Floats, Ints, Keys
+from mbagent_envs.jit import compiled
+from mbagent_envs.random_keys import uniform_at
+
+
+class Work(NamedTuple):
+    """Work space for one row at a time.
+
+    Attributes:
+        on: which columns are on, bool [D + D' + M'], those of the next state last.
+        values: of all units, int64 [U].
+        rates: all units' distributions, [sum of cardinalities].
+        still: which units have no graphs, bool [U].
+        later: which units are drawn late, bool [U].
+        shown: where each factor's columns begin among the state's, int64 [F + 1].
+        joint: the distribution of a coupling, or of a unit.
+    """
+
+    on: Bools
+    values: Ints
+    rates: Floats
+    still: Bools
+    later: Bools
+    shown: Ints
+    joint: Floats
+
+
+@compiled
+def work_space(layout: Layout, graphs: Graphs, late: Graphs) -> Work:
+    """Room for a row."""
+    still, later = np.ones(len(layout.outputs), dtype=np.bool_), np.zeros(len(layout.outputs), dtype=np.bool_)
+    still[graphs.changing], later[late.changing] = False, True
+    return Work(
+        np.empty(n_columns(layout) + len(layout.factor) + len(layout.next_meetings), dtype=np.bool_),
+        np.zeros(len(layout.outputs), dtype=np.int64),
+        np.empty(graphs.start[-1], dtype=np.float64),
+        still,
+        later,
+        np.searchsorted(layout.factor, np.arange(layout.n_factors + 1)),
+        np.empty(widest(layout), dtype=np.float64),
+    )
+
+
+@compiled
+def alone(layout: Layout, graphs: Graphs, later: Bools) -> Ints:
+    """Units with graphs that are drawn each for itself, before those that are drawn late."""
+    chosen = np.zeros(len(layout.outputs), dtype=np.bool_)
+    for unit in graphs.changing:
+        chosen[unit] = layout.coupling_of[unit] < 0 and not later[unit]
+    return np.flatnonzero(chosen)
+
+
+@compiled
+def event_rates(states: Ints, actions: Ints, layout: Layout, graphs: Graphs) -> Floats:
+    """Probability of the event, [B]."""
+    w, rates = work_space(layout, graphs, graphs), np.empty(len(states), dtype=np.float64)
+    event = np.array([len(layout.outputs) - 1])
+    for b in range(len(states)):
+        show(states[b], actions[b], layout, w.on)
+        distributions(event, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
+        rates[b] = w.rates[graphs.start[-1] - 1]
+    return rates
+
+
+@compiled
+def _pick(probs: Floats, start: int, n: int, u: float, otherwise: int) -> int:
+    """Index drawn from ``n`` numbers of ``probs``, or the likeliest where ``u`` is negative."""
+    if u < 0.0:
+        return int(np.argmax(probs[start : start + n]))
+    chosen = otherwise
+    for k in range(n):
+        if probs[start + k] > 0.0:
+            chosen = k
+            u -= probs[start + k]
+            if u < 0.0:
+                break
+    return chosen
+
+
+@compiled
+def sample(
+    states: Ints,
+    actions: Ints,
+    keys: Keys,
+    greedy: bool,
+    layout: Layout,
+    graphs: Graphs,
+    late: Graphs,
+    following: Ints,
+    terminated: Bools,
+) -> None:
+    """Draws next states into ``following`` [B, F] and ``terminated`` [B], unit u of row b at number u of key b.
+
+    ``following`` holds a copy of ``states``; ``greedy`` takes the likeliest value each time instead.
+    """
+    w, n_units = work_space(layout, graphs, late), len(layout.outputs)
+    early = alone(layout, graphs, w.later)
+    for b in range(len(states)):
+        show(states[b], actions[b], layout, w.on)
+        distributions(graphs.changing, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
+        terminated[b] = False
+        for unit in early:
+            u = -1.0 if greedy else uniform_at(keys[b], unit)
+            _draw(unit, u, w, layout, graphs, following[b], terminated, b)
+        for q in range(len(layout.exactly)):
+            n = couple(q, states[b], w.rates, w.still, layout, graphs, w.joint)
+            u = -1.0 if greedy else uniform_at(keys[b], n_units + q)
+            settle(following[b], q, _pick(w.joint, 0, n + 1, u, n), layout)
+        if len(late.changing):
+            show_next(following[b], layout, w.on)
+        for i in range(len(late.changing)):
+            unit = late.changing[i]
+            if is_late(unit, actions[b], w, layout, graphs):
+                if unit == n_units - 2:
+                    show_next_meetings(following[b], layout, w.on)
+                distributions(late.changing[i : i + 1], states[b], actions[b], layout, late, w.on, w.values, w.rates)
+            u = -1.0 if greedy else uniform_at(keys[b], unit)
+            _draw(unit, u, w, layout, late, following[b], terminated, b)
+            _show_unit(unit, following[b], w, layout)
+
+
+@compiled
+def is_late(unit: int, action: int, w: Work, layout: Layout, graphs: Graphs) -> bool:
+    """Whether a unit that has late graphs needs them here: of what may follow, more than one value was observed, or is likely.
+
+    Args:
+        unit: its number.
+        action: the action.
+        w: columns, present values and rates, as ``distributions`` left them.
+        layout: the units.
+        graphs: of each unit for itself.
+    """
+    n = layout.outputs[unit]
+    if unit == len(layout.outputs) - 2 or settled(w.rates, graphs.start[unit], n) < 0:
+        return True
+    pair = graphs.pairs[unit] + layout.acts.way[action] * n + w.values[unit]
+    for entry in range(graphs.entries[pair], graphs.entries[pair + 1]):
+        node = graphs.nodes[entry]
+        while graphs.column[node] >= 0:
+            node = graphs.on[node] if w.on[graphs.column[node]] else graphs.off[node]
+        if graphs.spread[node] > 0.0:
+            return True
+    return False
+
+
+@compiled
+def _show_unit(unit: int, following: Ints, w: Work, layout: Layout) -> None:
+    """Shows what a unit became."""
+    n = n_columns(layout)
+    for member in range(layout.first[unit], layout.first[unit + 1]):
+        factor = layout.members[member]
+        for column in range(w.shown[factor], w.shown[factor + 1]):
+            w.on[n + column] = layout.value[column] <= following[factor] <= layout.top[column]
+
+
+@compiled
+def _draw(unit: int, u: float, w: Work, layout: Layout, graphs: Graphs, following: Ints, terminated: Bools, b: int) -> None:
+    """Draws a unit's value into a next state [F], or into ``terminated[b]``."""
+    chosen = _pick(w.rates, graphs.start[unit], layout.outputs[unit], u, w.values[unit])
+    if unit == len(layout.outputs) - 2:
+        terminated[b] = chosen == 1
+    elif chosen != w.values[unit]:
+        write(following, unit, chosen, layout)
+
+
+@compiled
+def log_prob(
+    states: Ints, actions: Ints, following: Ints, terminated: Bools, layout: Layout, graphs: Graphs, late: Graphs
+) -> Floats:
+    """Log-probability [B] of next states [B, F] and ends [B]."""
+    w, n_units, result = work_space(layout, graphs, late), len(layout.outputs), np.zeros(len(states), dtype=np.float64)
+    other, everything = np.empty(states.shape[1], dtype=np.int64), np.arange(n_units - 1)
+    for b in range(len(states)):
+        show(states[b], actions[b], layout, w.on)
+        distributions(everything, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
+        if len(late.changing):
+            show_next(following[b], layout, w.on)
+            show_next_meetings(following[b], layout, w.on)
+        for i in range(len(late.changing)):
+            if is_late(late.changing[i], actions[b], w, layout, graphs):
+                distributions(late.changing[i : i + 1], states[b], actions[b], layout, late, w.on, w.values, w.rates)
+        other[:] = states[b]
+        for unit in everything:
+            if layout.coupling_of[unit] >= 0:
+                continue
+            then = int(terminated[b]) if unit == n_units - 2 else read(following[b], int(unit), layout)
+            p = w.rates[graphs.start[unit] + then]
+            result[b] += math.log(p) if p > 0.0 else -math.inf
+            if unit < n_units - 2 and then != w.values[unit]:
+                write(other, int(unit), then, layout)
+        for q in range(len(layout.exactly)):
+            couple(q, states[b], w.rates, w.still, layout, graphs, w.joint)
+            then = which(following[b], q, layout)
+            result[b] += math.log(w.joint[then]) if then >= 0 and w.joint[then] > 0.0 else -math.inf
+            settle(other, q, then, layout)
+        if not (other == following[b]).all():  # a group with no bit on, or with several
+            result[b] = -math.inf
+    return result
+
+
+@compiled
+def marginals(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, start: Ints, out: Floats) -> None:
+    """Writes each factor's distribution to ``out`` [B, sum of cardinalities]; factor f's begins at ``start[f]``."""
+    w, everything = work_space(layout, graphs, graphs), np.arange(len(layout.outputs) - 2)
+    for b in range(len(states)):
+        show(states[b], actions[b], layout, w.on)
+        distributions(everything, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
+        for unit in everything:
+            first, last = layout.first[unit], layout.first[unit + 1]
+            for k in range(layout.outputs[unit]):
+                p = w.rates[graphs.start[unit] + k]
+                if last - first == 1:
+                    out[b, start[layout.members[first]] + k] = p
+                else:
+                    _write_bit(out[b], start[layout.members[first + k]], p)
+        for q in range(len(layout.exactly)):
+            n = couple(q, states[b], w.rates, w.still, layout, graphs, w.joint)
+            for k in range(n):
+                factor = layout.members[layout.first[layout.coupled[layout.coupled_first[q] + k]]]
+                _write_bit(out[b], start[factor], w.joint[k])
+
+
+@compiled
+def _write_bit(out: Floats, start: int, p: float) -> None:
+    out[start], out[start + 1] = 1.0 - p, p
+
+
+@compiled
+def settled(probs: Floats, start: int, n: int) -> int:
+    """The only one of ``n`` values worth drawing, or -1."""
+    best = 0
+    for k in range(1, n):
+        if probs[start + k] > probs[start + best]:
+            best = k
+    for k in range(n):
+        if k != best and probs[start + k] >= NEGLIGIBLE * probs[start + best]:
+            return -1
+    return best
+
+
+@compiled
+def only_possible(probs: Floats, start: int, n: int) -> int:
+    """The only one of ``n`` values with a probability above 0, or -1."""
+    best = -1
+    for k in range(n):
+        if probs[start + k] > 0.0:
+            if best >= 0:
+                return -1
+            best = k
+    return best
+
+
+@compiled
+def uncertain(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, units: Ints) -> Bools:
+    """In which rows some units need their late graphs, bool [B, len(units)]."""
+    w, result = work_space(layout, graphs, graphs), np.zeros((len(states), len(units)), dtype=np.bool_)
+    for b in range(len(states)):
+        show(states[b], actions[b], layout, w.on)
+        distributions(units, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
+        for i in range(len(units)):
+            result[b, i] = is_late(units[i], actions[b], w, layout, graphs)
+    return result

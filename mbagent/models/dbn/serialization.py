@@ -1,0 +1,105 @@
+"""Decision graphs to and from plain arrays; what comes from a file is checked, since compiled kernels check nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.dbn.arrays import Graphs
+from mbagent.models.dbn.features import Layout
+
+SAVED = tuple(name for name in Graphs._fields if name != "noise")
+"""Fields that are kept in files: how graphs are read for planning is no part of what was learned."""
+
+_FLOATS = ("rate", "spread", "stays", "novelty", "base", "still")
+
+
+def to_arrays(graphs: Graphs) -> dict[str, NDArray[Any]]:
+    """The graphs' arrays by name."""
+    return {name: array.copy() for name, array in graphs._asdict().items() if name in SAVED}
+
+
+def table_of(array: NDArray[Any], width: int) -> NDArray[np.int64]:
+    """Whole numbers, int64 [n, width].
+
+    Raises:
+        ValueError: the array has another width.
+    """
+    if np.ndim(array) != 2 or np.shape(array)[1] != width:
+        raise ValueError(f"These weights do not fit: a table of {width} columns has the shape {np.shape(array)}.")
+    return np.ascontiguousarray(array, dtype=np.int64)
+
+
+def from_arrays(arrays: Mapping[str, NDArray[Any]], layout: Layout, n_columns: int) -> Graphs:
+    """The graphs that ``to_arrays`` took apart.
+
+    Args:
+        arrays: by name.
+        layout: the units.
+        n_columns: number of columns that nodes can ask for.
+
+    Raises:
+        ValueError: they are no graphs of these units.
+    """
+    missing = sorted(set(SAVED) ^ set(arrays))
+    if missing:
+        raise ValueError(f"These weights are no decision graphs (first difference: {missing[0]!r}).")
+    kinds = {name: np.float64 if name in _FLOATS else np.int64 for name in SAVED}
+    flat: dict[str, Any] = {name: np.ascontiguousarray(array, dtype=kinds[name]).reshape(-1) for name, array in arrays.items()}
+    graphs = Graphs(**flat, noise=np.zeros(1))
+    if not _sound(graphs, layout, n_columns):
+        raise ValueError(
+            "These weights do not fit: they are no graphs of these units; load them into a model of the same environment."
+        )
+    return graphs
+
+
+def _sound(graphs: Graphs, layout: Layout, n_columns: int) -> bool:
+    """Whether every index leads somewhere and no path is endless."""
+    n_units, n_nodes, n_entries = len(layout.outputs), len(graphs.column), len(graphs.values)
+    pairs = np.concatenate([[0], np.cumsum(layout.acts.n_ways * layout.outputs)])
+    start = np.concatenate([[0], np.cumsum(layout.outputs)])
+    if not (np.array_equal(graphs.pairs, pairs) and np.array_equal(graphs.start, start)):
+        return False
+    lengths = {
+        "off": n_nodes,
+        "on": n_nodes,
+        "rate": n_nodes,
+        "spread": n_nodes,
+        "nodes": n_entries,
+        "entries": pairs[-1] + 1,
+        "stays": pairs[-1],
+        "novelty": pairs[-1],
+        "base": start[-1],
+        "still": 1,
+    }
+    if any(len(getattr(graphs, name)) != length for name, length in lengths.items()):
+        return False
+    asks, numbers = graphs.column >= 0, np.arange(n_nodes)
+    return bool(
+        _within(graphs.changing, n_units)
+        and _within(graphs.column + 1, n_columns + 1)
+        and _within(graphs.nodes, n_nodes)
+        and (np.diff(graphs.entries) >= 0).all()
+        and (graphs.entries[0], graphs.entries[-1]) == (0, n_entries)
+        and ((graphs.off >= 0) & (graphs.off < numbers))[asks].all()
+        and ((graphs.on >= 0) & (graphs.on < numbers))[asks].all()
+        and _values_fit(graphs, layout)
+        and all(np.isfinite(getattr(graphs, name)).all() for name in _FLOATS)
+        and all((getattr(graphs, name) >= 0.0).all() and (getattr(graphs, name) <= 1.0).all() for name in _FLOATS)
+        and (np.add.reduceat(graphs.base, start[:-1]) <= 1.0 + 1e-6).all()
+    )
+
+
+def _values_fit(graphs: Graphs, layout: Layout) -> bool:
+    """Whether each entry's value is one that its unit has."""
+    pair = np.repeat(np.arange(len(graphs.entries) - 1), np.diff(graphs.entries))
+    unit = np.searchsorted(graphs.pairs, pair, side="right") - 1
+    return bool(((graphs.values >= 0) & (graphs.values < layout.outputs[unit])).all())
+
+
+def _within(values: NDArray[np.int64], n: int) -> bool:
+    return bool(((values >= 0) & (values < n)).all())

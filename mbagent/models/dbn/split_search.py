@@ -1,0 +1,318 @@
+"""Greedy search for the splits of decision graphs, by single features and by pairs (paper section 5, modules).
+
+The most certain splits provide a prior for the others: which kinds of features are causes at all, whether one feature serves many
+targets or each target has its own, and how many causes a target has. With little data this prior decides. A pair of features that
+matters only jointly, such as exclusive or, changes no target by itself, so all pairs are scored at once: the counts of their four
+cells in a context are one matrix product.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from mbagent.models.dbn.leaf_prior import best_prior
+from mbagent.models.dbn.score import Chosen, Columns, Head, Tables, best_split, columns_of, evidence, evidence_tables, evidences
+from mbagent.models.dbn.splits import Pair, Search
+from mbagent.types import Bools, Floats, Ints
+from mbagent_envs.jit import compiled
+
+PATTERNS: tuple[tuple[bool, bool, bool, bool], ...] = (
+    (False, False, False, True),
+    (False, False, True, False),
+    (False, True, False, False),
+    (True, False, False, False),
+    (False, True, True, False),
+)
+"""Which of the cells (neither, second only, first only, both) are told apart from the others."""
+
+FEWEST = 20
+"""Rows that a context must have."""
+
+FIRST = 3.0
+"""Log prior odds against one more cause, before any was found."""
+
+LEAST = 1.0
+"""Least price of a cause, nats, however likely the prior makes it."""
+
+MOST_WORK = 5_000_000_000
+"""Pairs of columns are looked for in a context as long as rows times columns times columns stay below this."""
+
+TELLING = 2
+"""Pairs from which on their kinds tell what kinds the next ones are of."""
+
+MOST_CONTEXTS = 4
+"""Contexts of a head that pairs are looked for in, the most mixed ones."""
+
+
+MOST_COLUMNS = 500
+"""Columns that pairs are made of; of more, those that tell most by themselves."""
+
+EXACT = 2**24
+"""Sums up to here are exact in single precision."""
+
+SPARSE = 16.0
+"""Pairs of columns that are on are counted one by one where a matrix product would take so many times as many steps."""
+
+
+class PairSearch:
+    """Looks for pairs of columns where single ones explain nothing more.
+
+    Args:
+        kinds: kind of each column, int64 [D].
+        table: columns of all rows, bool [N, D].
+        tables: see ``evidence_tables``.
+    """
+
+    def __init__(self, kinds: Ints, table: Bools, tables: Tables) -> None:
+        """See the class."""
+        self.kinds, self.table, self.tables = kinds, table, tables
+        self._seen: dict[int, int] = {}
+        self._found: list[Pair] = []
+
+    def divide(self, searches: Sequence[Search]) -> bool:
+        """One round over all heads that changed since the last; whether any pair was found."""
+        prior, found = self._prior(), False
+        for h, search in enumerate(searches):
+            if not search.open or self._seen.get(h) == len(search.splits):
+                continue
+            worth = self._worth(search, float(prior.max()))
+            pairs = find_pairs(search.head, worth, self.table, prior, self._pattern_prior(), self.tables)
+            for pair in pairs:
+                search.divide_by_pair(pair, self.table)
+            self._found += pairs
+            found = found or bool(pairs)
+            self._seen[h] = len(search.splits) if not pairs else -1
+        return found
+
+    def _worth(self, search: Search, most: float) -> list[int]:
+        """Contexts whose rows are so mixed that a pair could pay its price, the most mixed first."""
+        n, e = search.counts()
+        cost = -evidences(e, n, self.tables)
+        return [int(c) for c in np.argsort(-cost, kind="stable")[:MOST_CONTEXTS] if cost[c] > -most]
+
+    def _pattern_prior(self) -> Floats:
+        """Log probability of each pattern: those found already are likelier."""
+        counts = np.full(len(PATTERNS), 0.2)
+        if len(self._found) >= TELLING:
+            for pair in self._found:
+                counts[PATTERNS.index(pair.pattern)] += 1.0
+        result: Floats = np.log(counts / counts.sum())
+        return result
+
+    def _prior(self) -> Floats:
+        """Log prior odds of each pair of columns, [D, D]: pairs of a kind already found are likelier, of fresh columns most."""
+        n = len(self.kinds)
+        if len(self._found) < TELLING:
+            return np.full((n, n), -math.log(max(1.0, n * (n - 1) / 2)) - FIRST)
+        n_kinds = int(self.kinds.max()) + 1
+        share, used = np.full((n_kinds, n_kinds), 0.2 / n_kinds**2), np.zeros(n, dtype=np.bool_)
+        for pair in self._found:
+            k, m = self.kinds[pair.first], self.kinds[pair.second]
+            share[k, m] += 0.5
+            share[m, k] += 0.5
+            used[[pair.first, pair.second]] = True
+        fresh = np.bincount(self.kinds[~used], minlength=n_kinds).clip(1)
+        # Where some columns of one kind each had a partner of another kind, the next one has, too: only who it is has a price.
+        odds = np.log(share / share.sum() / np.maximum.outer(fresh, fresh))[self.kinds[:, None], self.kinds]
+        result: Floats = odds - LEAST - np.where(used[:, None] | used, 3.0, 0.0)
+        return result
+
+
+def find_pairs(head: Head, contexts: Sequence[int], table: Bools, prior: Floats, patterns: Floats, tables: Tables) -> list[Pair]:
+    """The best pair, and after it further ones in the same context that have no column in common with those before.
+
+    Args:
+        head: the rows.
+        contexts: contexts to look in.
+        table: columns of all rows, bool [N, D].
+        prior: log prior odds of each pair of columns, [D, D].
+        patterns: log probability of each pattern.
+        tables: see ``evidence_tables``.
+    """
+    found: list[Pair] = []
+    for context in contexts:
+        rows = head.context == context
+        if head.seen[rows].sum() >= FEWEST and rows.sum() * min(table.shape[1], MOST_COLUMNS) ** 2 < MOST_WORK:
+            here, seen, came = table[head.rows[rows]], head.seen[rows], head.came[rows]
+            kept = _telling_most(here, seen, came, tables)
+            pairs = _in_context(context, here[:, kept], seen, came, prior[np.ix_(kept, kept)], patterns, tables)
+            found += [pair._replace(first=int(kept[pair.first]), second=int(kept[pair.second])) for pair in pairs]
+    best = max(found, default=None)
+    return [] if best is None else [pair for pair in found if pair.context == best.context]
+
+
+def _telling_most(table: Bools, seen: Ints, came: Ints, tables: Tables) -> Ints:
+    """Numbers of the columns that pairs are made of, ascending: all of them, or those that tell most by themselves."""
+    n_columns = table.shape[1]
+    if n_columns <= MOST_COLUMNS:
+        return np.arange(n_columns)
+    on = table.T.astype(np.float64)
+    n, e = (np.rint(on @ weights).astype(np.int64) for weights in (seen, came))
+    gain = evidences(e, n, tables) + evidences(came.sum() - e, seen.sum() - n, tables)
+    return np.sort(np.argsort(-gain, kind="stable")[:MOST_COLUMNS])
+
+
+def _in_context(
+    context: int, table: Bools, seen: Ints, came: Ints, prior: Floats, patterns: Floats, tables: Tables
+) -> list[Pair]:
+    arrived = came > 0
+    both_n, both_e = _both(table, seen), _both(table[arrived], came[arrived])
+    best, which = _best_patterns(both_n, both_e, int(seen.sum()), int(came.sum()), np.asarray(PATTERNS), patterns, prior, tables)
+    pairs: list[Pair] = []
+    while best.size and (top := float(best.max())) > 0.0:
+        first, second = (int(i) for i in np.unravel_index(int(best.argmax()), best.shape))
+        pattern = PATTERNS[which[first, second]]
+        if pairs and (pattern != PATTERNS[0] or pairs[0].pattern != PATTERNS[0]):
+            break
+        pairs.append(Pair(top, context, first, second, pattern))
+        best[[first, second]] = best[:, [first, second]] = -np.inf
+    return pairs
+
+
+def _both(on: Bools, weights: Ints) -> Ints:
+    """Weight of the rows in which both of two columns are on, int64 [D, D]; only the upper triangle counts."""
+    per_row = on.sum(axis=1)
+    if SPARSE * float((per_row**2).sum()) < float(on.size) * on.shape[1]:
+        first = np.concatenate([[0], np.cumsum(per_row)]).astype(np.int64)
+        result: Ints = _count_both(first, np.nonzero(on)[1], weights, on.shape[1])
+        return result
+    exact = np.float32 if weights.sum() < EXACT else np.float64
+    wide = on.astype(exact)
+    product: Ints = np.rint((wide * weights[:, None].astype(exact)).T @ wide).astype(np.int64)
+    return product
+
+
+@compiled
+def _count_both(first: Ints, column: Ints, weights: Ints, n_columns: int) -> Ints:
+    """As ``_both``, of columns in compressed rows, ascending in each."""
+    both = np.zeros((n_columns, n_columns), dtype=np.int64)
+    for r in range(len(weights)):
+        for i in range(first[r], first[r + 1]):
+            for j in range(i, first[r + 1]):
+                both[column[i], column[j]] += weights[r]
+    return both
+
+
+@compiled
+def _best_patterns(
+    both_n: Ints, both_e: Ints, n: int, e: int, inside: Bools, patterns: Floats, prior: Floats, tables: Tables
+) -> tuple[Floats, Ints]:
+    """Evidence beyond its price of each pair of columns under its best pattern, [D, D], and the pattern's number.
+
+    Below the diagonal and on it there are no pairs.
+    """
+    one, two, alike = tables
+    size = len(both_n)
+    best, which = np.full((size, size), -math.inf), np.zeros((size, size), dtype=np.int64)
+    cells_n, cells_e, before = np.zeros(4, dtype=np.int64), np.zeros(4, dtype=np.int64), evidence(e, n, one, two, alike)
+    for i in range(size):
+        for j in range(i + 1, size):
+            for cells, both, total in ((cells_n, both_n, n), (cells_e, both_e, e)):
+                cells[3] = both[i, j]
+                cells[2] = both[i, i] - both[i, j]
+                cells[1] = both[j, j] - both[i, j]
+                cells[0] = total - cells[1] - cells[2] - cells[3]
+            for number in range(len(inside)):
+                n_in, e_in = 0, 0
+                for cell in range(4):
+                    if inside[number, cell]:
+                        n_in += cells_n[cell]
+                        e_in += cells_e[cell]
+                gain = patterns[number] + evidence(e_in, n_in, one, two, alike)
+                gain += evidence(e - e_in, n - n_in, one, two, alike)
+                if gain > best[i, j]:
+                    best[i, j], which[i, j] = gain, number
+            best[i, j] += prior[i, j] - before
+    return best, which
+
+
+SUREST = 0.99
+"""A rate is believed to be 0 or 1 beforehand with this probability at most."""
+
+MOST_SPLITS = 256
+"""Most splits of one head."""
+
+
+def find_splits(heads: Sequence[Head], table: Bools, kinds: Ints, n_actions: int, in_pairs: bool = True) -> list[Search]:
+    """The splits of each head, and its rows with the contexts that they lead to.
+
+    A first search tells how much of this world is certain at all; the second one knows.
+
+    Args:
+        heads: what is to be explained.
+        table: columns of all rows that look different, bool [N, D].
+        kinds: which kind of thing each column is, int64 [D]; causes of one kind make others of that kind likelier.
+        n_actions: number of actions A.
+        in_pairs: whether to look for causes that matter only together, too.
+    """
+    columns = columns_of(table)
+    most = max((int(head.seen.sum()) for head in heads), default=0) + 1
+    first = _searched(heads, table, columns, kinds, n_actions, evidence_tables(most), False)
+    return _searched(heads, table, columns, kinds, n_actions, evidence_tables(most, certainty(first)), in_pairs)
+
+
+def certainty(searches: Sequence[Search]) -> float:
+    """Share of what was found that is not random at all, as believed of the rest."""
+    return min(best_prior(searches).certain, SUREST)
+
+
+def _searched(
+    heads: Sequence[Head], table: Bools, columns: Columns, kinds: Ints, n_actions: int, tables: Tables, in_pairs: bool
+) -> list[Search]:
+    searches = [Search(head) for head in heads]
+    for search in searches:
+        search.merge(tables)
+    go_on(searches, table, columns, kinds, n_actions, tables, in_pairs)
+    return searches
+
+
+def go_on(
+    searches: Sequence[Search], table: Bools, columns: Columns, kinds: Ints, n_actions: int, tables: Tables, in_pairs: bool
+) -> None:
+    """Divides further as long as evidence grows; see ``find_splits``."""
+    pairs = PairSearch(kinds, table, tables)
+    going = True
+    while going:
+        while found := _next_splits(searches, columns, kinds, n_actions, tables):
+            for h, chosen in found:
+                searches[h].divide(chosen, table, tables)
+                searches[h].open = len(searches[h].splits) < MOST_SPLITS
+        going = in_pairs and pairs.divide(searches)
+
+
+def _next_splits(
+    searches: Sequence[Search], columns: Columns, kinds: Ints, n_actions: int, tables: Tables
+) -> list[tuple[int, Chosen]]:
+    """One more split for each head that has one: of all heads, or of the surer half once there is a prior to teach."""
+    prior, learned = column_prior(searches, kinds, columns.n_columns)
+    counts = np.asarray([sum(split.column >= 0 for split in search.splits) for search in searches])
+    narrow = -np.asarray([math.log(n_actions) + 1.0, 2.0, 3.0])
+    found = []
+    for h, search in enumerate(searches):
+        if search.open:
+            more = ((counts > counts[h]).sum() + 0.5) / ((counts >= counts[h]).sum() + 1.0)
+            odds = math.log(more / (1.0 - more)) if learned else -FIRST
+            chosen = best_split(search.head, search.tally(columns), np.minimum(prior + odds, -LEAST), narrow, tables)
+            if chosen.gain > 0.0:
+                found.append((h, chosen))
+    found.sort(key=lambda entry: -entry[1].gain)
+    return found[: max(1, len(found) // 2)] if learned and found else found
+
+
+def column_prior(searches: Sequence[Search], kinds: Ints, n_columns: int) -> tuple[Floats, bool]:
+    """Log probability of each column to be the next cause [D], and whether it was learned from those found so far."""
+    chosen = [split.column for search in searches for split in search.splits if split.column >= 0]
+    if len(chosen) < max(3, len(searches) // 10):
+        return np.full(n_columns, -math.log(n_columns)), False
+    used = np.bincount(chosen, minlength=n_columns).astype(np.float64)
+    n_kinds = int(kinds.max()) + 1
+    again = (0.5 + np.maximum(used - 1, 0).sum()) / (len(chosen) + 1.0)
+    of_kind = np.bincount(kinds, weights=used, minlength=n_kinds) + 0.2
+    of_kind /= of_kind.sum()
+    fresh = np.bincount(kinds[used == 0], minlength=n_kinds).clip(1)
+    reused = np.bincount(kinds[used > 0], minlength=n_kinds).clip(1)
+    share = np.where(used == 0, (1.0 - again) / fresh[kinds], again / reused[kinds])
+    return np.log(of_kind[kinds] * share), True

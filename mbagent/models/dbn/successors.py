@@ -1,0 +1,324 @@
+"""Successors of decision graphs in compiled code, for every variable in every row; see ``systematic_sampling.py``.
+
+Compiled search uses them where variables have synchronic arcs or resets happen, see ``WholeKernel``; elsewhere ``expander.py``.
+Shapes: B rows, F factors, U variables (the last two are ``terminated`` and the reset), Q mutex groups.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.dbn.affected_variables import Lean, ends_late_only, lean
+from mbagent.models.dbn.arrays import Graphs, distributions, n_columns, show, show_next, show_next_meetings, write
+from mbagent.models.dbn.features import Layout
+from mbagent.models.dbn.fitting import Fitted, nothing_late
+from mbagent.models.dbn.invariants import leave_out
+from mbagent.models.dbn.mutex import couple, leave_out_none, n_choices, settle
+from mbagent.models.dbn.sampling import Work, alone, is_late, only_possible, work_space
+from mbagent.models.overloads import Outcomes, implements, outcomes, work_for
+from mbagent.models.protocol import Successors
+from mbagent.models.systematic_sampling import (
+    MAIN,
+    MASS,
+    STRATA,
+    Found,
+    Grid,
+    Particles,
+    begin,
+    n_outcomes,
+    n_possible,
+    new_particles,
+    place_of,
+    room,
+    share_out,
+    slot_of,
+    used,
+    weigh,
+)
+from mbagent.types import Bools, Floats, Ints
+from mbagent_envs.jit import compiled
+
+
+@compiled
+def successors(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, late: Graphs, grid: Grid) -> Found:
+    """The outcomes of each row, unit after unit; see ``particles.py``. The graphs must be those for planning."""
+    w, n_units, n_grid = work_space(layout, graphs, late), len(layout.outputs), grid[0]
+    single = alone(layout, graphs, w.later)
+    early = np.concatenate((single[single < n_units - 1], n_units + np.arange(len(layout.exactly))))
+    width = n_units + len(layout.exactly)
+    p, found = new_particles(n_grid, width, len(w.joint)), room(len(states), n_grid, states.shape[1] + 1)
+    still_open, base = np.empty(width, dtype=np.int64), np.empty(states.shape[1], dtype=np.int64)
+    total = 0
+    for b in range(len(states)):
+        show(states[b], actions[b], layout, w.on)
+        distributions(graphs.changing, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
+        base[:] = states[b]
+        n_open, ended = 0, False
+        begin(p, n_grid, _fits(early, states[b], actions[b], layout, graphs, late, w, n_grid), place_of(states[b]))
+        for number in early:
+            n, value = _distribution(number, states[b], layout, graphs, w)
+            best = only_possible(w.joint, 0, n)
+            if best >= 0:
+                if best != value:
+                    ended = _put(base, number, best, layout, ended)
+                continue
+            still_open[n_open] = number
+            share_out(p, -1, number, n_open, w.joint, n, number == n_units - 2, grid)
+            n_open += 1
+        if len(late.changing):
+            n_open = _split_late(p, n_open, states[b], actions[b], base, still_open, ended, layout, graphs, late, w, grid)
+        _list(p, n_open, base, still_open, ended, layout, found, b, total, n_grid)
+        total += found[0][b]
+    return used(found, total)
+
+
+@compiled
+def _fits(early: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs, late: Graphs, w: Work, n_grid: int) -> bool:
+    """Whether all outcomes of a row can be listed."""
+    possible = 1
+    for number in early:
+        if number >= len(layout.outputs):
+            possible *= n_choices(number - len(layout.outputs), state, w.rates, w.still, layout, graphs)
+        else:
+            possible *= n_possible(w.rates, graphs.start[number], layout.outputs[number])
+        if possible > n_grid:
+            return False
+    for unit in late.changing:
+        late_here = is_late(unit, action, w, layout, graphs)
+        possible *= layout.outputs[unit] if late_here else n_possible(w.rates, graphs.start[unit], layout.outputs[unit])
+        possible = min(possible, 2 * n_grid + 1)
+    return bool(possible <= 2 * n_grid)
+
+
+@compiled
+def _distribution(number: int, state: Ints, layout: Layout, graphs: Graphs, w: Work) -> tuple[int, int]:
+    """Writes the distribution of a unit, or of a coupling, to ``w.joint``; returns its size and the present value or -1."""
+    n_units = len(layout.outputs)
+    if number >= n_units:
+        n = couple(number - n_units, state, w.rates, w.still, layout, graphs, w.joint) + 1
+        leave_out_none(w.joint, n)
+        return n, -1
+    n, start = layout.outputs[number], graphs.start[number]
+    w.joint[:n] = w.rates[start : start + n]
+    return n, w.values[number]
+
+
+@compiled
+def _split_late(
+    p: Particles,
+    n_open: int,
+    state: Ints,
+    action: int,
+    base: Ints,
+    still_open: Ints,
+    ended: bool,
+    layout: Layout,
+    graphs: Graphs,
+    late: Graphs,
+    w: Work,
+    grid: Grid,
+) -> int:
+    """Draws the late units, each given what the particle became so far; returns how many open units there are."""
+    following, end = np.empty_like(base), len(layout.outputs) - 2
+    for i in range(len(late.changing)):
+        number = late.changing[i]
+        n, start = layout.outputs[number], late.start[number]
+        still_open[n_open] = number
+        if not is_late(number, action, w, layout, graphs):
+            w.joint[:n] = w.rates[start : start + n]
+            share_out(p, -1, number, n_open, w.joint, n, number == end, grid)
+            n_open += 1
+            continue
+        n_main, n_strata = p.state[MAIN], p.state[STRATA]
+        for j in range(n_main + n_strata):
+            slot = grid[0] + j if j < n_strata else j - n_strata  # strata first
+            _fill(following, base, p, slot, still_open, n_open, layout, ended)
+            show_next(following, layout, w.on)
+            if number == end:
+                show_next_meetings(following, layout, w.on)
+            distributions(late.changing[i : i + 1], state, action, layout, late, w.on, w.values, w.rates)
+            w.joint[:n] = w.rates[start : start + n]
+            share_out(p, slot, number, n_open, w.joint, n, number == end, grid)
+        n_open += 1
+    return n_open
+
+
+@compiled
+def _list(
+    p: Particles,
+    n_open: int,
+    base: Ints,
+    still_open: Ints,
+    ended: bool,
+    layout: Layout,
+    found: Found,
+    b: int,
+    total: int,
+    n_grid: int,
+) -> None:
+    """Writes the outcomes of row b from number ``total`` on."""
+    counts, following, terminated, probabilities, left = found
+    weigh(p, n_grid)
+    left[b] = p.left[0]
+    counts[b] = n_outcomes(p)
+    for i in range(counts[b]):
+        slot = slot_of(p, i, n_grid)
+        terminated[total + i] = _fill(following[total + i], base, p, slot, still_open, n_open, layout, ended)
+        probabilities[total + i] = p.chances[slot, MASS]
+
+
+@compiled
+def _fill(state: Ints, base: Ints, p: Particles, slot: int, still_open: Ints, n_open: int, layout: Layout, ended: bool) -> bool:
+    """Writes the next state that a particle stands for; returns whether the episode is over."""
+    state[:] = base
+    over = ended
+    for v in range(n_open):
+        over = _put(state, still_open[v], p.factors[slot, v], layout, over)
+    return over
+
+
+@compiled
+def _put(state: Ints, number: int, value: int, layout: Layout, ended: bool) -> bool:
+    """Gives a unit or coupling its value in a next state; returns whether the episode is over."""
+    n_units = len(layout.outputs)
+    if number == n_units - 2:
+        return value == 1
+    if number >= n_units:
+        settle(state, number - n_units, value, layout)
+    else:
+        write(state, number, value, layout)
+    return ended
+
+
+@compiled
+def event_draws(rate: float, n_grid: int) -> int:
+    """Of ``n_grid`` draws, those that go to the rare event: its share, or a quarter; one at least for each of what can happen."""
+    if rate <= 0.0 or rate >= 1.0:
+        return 0 if rate <= 0.0 else n_grid
+    return max(1, min(n_grid - 1, max(n_grid // 4, math.ceil(rate * n_grid))))
+
+
+def mixed(parts: Sequence[tuple[NDArray[np.int64], NDArray[np.float64], Successors]], n_rows: int) -> Successors:
+    """Several kinds of successors of the same rows: of each, which rows [b] it is of, its share of them [b], and what follows."""
+    rows = np.concatenate([which[found.rows] for which, _, found in parts])
+    weights = np.concatenate([found.probabilities * share[found.rows] for _, share, found in parts])
+    order = np.argsort(rows, kind="stable")
+    states = np.concatenate([found.states for _, _, found in parts])[order]
+    terminated = np.concatenate([found.terminated for _, _, found in parts])[order]
+    counts = np.bincount(rows, minlength=n_rows)
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return Successors(offsets, states, terminated, weights[order])
+
+
+class WholeKernel(NamedTuple):
+    """Decision graphs for compiled search, where some units are drawn late, or rare events happen.
+
+    Attributes:
+        layout, usual, late, event: see ``fitting.Fitted``; for planning.
+        event_late: graphs of nothing.
+        has_event: whether there are rare events.
+    """
+
+    layout: Layout
+    usual: Graphs
+    late: Graphs
+    event: Graphs
+    event_late: Graphs
+    has_event: bool
+
+
+def kernel_of(fitted: Fitted, cardinalities: tuple[int, ...]) -> Lean | WholeKernel:
+    """The kernel of fitted graphs for planning: the lean one where it says everything."""
+    if not fitted.has_event and ends_late_only(fitted.layout, fitted.late):
+        return lean(fitted.layout, fitted.usual, fitted.late, cardinalities)
+    none = nothing_late(fitted.event)
+    return WholeKernel(fitted.layout, fitted.usual, fitted.late, fitted.event, none, bool(fitted.has_event))
+
+
+class WholeWork(NamedTuple):
+    """Work space.
+
+    Attributes:
+        on: columns, bool [D].
+        values: of the units, int64 [U].
+        rates: their distributions, [sum of cardinalities].
+        actions: int64 [A].
+        states: int64 [1, F].
+        event: number of the event's unit, int64 [1].
+    """
+
+    on: Bools
+    values: Ints
+    rates: Floats
+    actions: Ints
+    states: Ints
+    event: Ints
+
+
+@implements(work_for, WholeKernel)
+@compiled
+def whole_work(kernel: WholeKernel, n_grid: int) -> WholeWork:
+    """See compiled_model."""
+    layout = kernel.layout
+    return WholeWork(
+        np.empty(n_columns(layout), dtype=np.bool_),
+        np.empty(len(layout.outputs), dtype=np.int64),
+        np.empty(kernel.usual.start[-1], dtype=np.float64),
+        np.arange(len(layout.acts.way)),
+        np.empty((1, layout.n_factors), dtype=np.int64),
+        np.array([len(layout.outputs) - 1]),
+    )
+
+
+@implements(outcomes, WholeKernel)
+@compiled
+def whole_outcomes(
+    kernel: WholeKernel, work: WholeWork, state: Ints, n_grid: int, key: np.uint64, offset: float, out: Outcomes
+) -> int:
+    """See compiled_model; every unit is asked."""
+    layout, graphs, states, actions, total = kernel.layout, kernel.usual, work.states, work.actions, 0
+    states[:] = state
+    for action in range(len(layout.acts.way)):
+        rate, a = 0.0, action
+        if kernel.has_event:
+            show(state, action, layout, work.on)
+            distributions(work.event, state, action, layout, graphs, work.on, work.values, work.rates)
+            rate = work.rates[graphs.start[-1] - 1]
+        draws, n, out.left_out[action] = event_draws(rate, n_grid), 0, 0.0
+        if rate < 1.0:
+            grid = (max(1, n_grid - draws), key, offset)
+            found = successors(states[:1], actions[a : a + 1], layout, graphs, kernel.late, grid)
+            n = _take(found[1], found[2], found[3], 1.0 - rate, total, out)
+            out.left_out[action] += (1.0 - rate) * found[4][0]
+        if rate > 0.0:
+            grid = (draws, key, offset)
+            found = successors(states[:1], actions[a : a + 1], layout, kernel.event, kernel.event_late, grid)
+            n += _take(found[1], found[2], found[3], rate, total + n, out)
+            out.left_out[action] += rate * found[4][0]
+        if len(layout.counts) or len(layout.met):
+            n = _leave_out(layout, state, total, n, out)
+        out.counts[action] = n
+        total += n
+    return total
+
+
+@compiled
+def _leave_out(layout: Layout, state: Ints, first: int, n: int, out: Outcomes) -> int:
+    """Takes what breaks a law out of the last ``n`` outcomes; returns how many are left."""
+    counts, met, weights, cells = layout.counts, layout.met, layout.weights, layout.cells
+    return leave_out(counts, met, weights, cells, state, out.states, out.terminated, out.probabilities, first, n)
+
+
+@compiled
+def _take(states: Ints, terminated: Bools, probabilities: Floats, share: float, total: int, out: Outcomes) -> int:
+    """Takes outcomes over, from number ``total`` on, which have a share of all; returns how many."""
+    for q in range(len(states)):
+        out.states[total + q] = states[q]
+        out.terminated[total + q] = terminated[q]
+        out.probabilities[total + q] = share * probabilities[q]
+    return len(states)

@@ -1,0 +1,75 @@
+"""Whether the next state hangs on more than the present one and the action: does the step before tell anything more?
+
+If it does, the observation is not the whole state, and ``mbagent.wrappers.History`` makes the past part of it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from mbagent.data import TransitionBatch
+from mbagent.models.dbn.features import Acts, shown_acts
+from mbagent.spaces import FactoredSpace, PlaneLayout
+
+PART = 2000
+"""Transitions looked at at once."""
+
+
+def following_steps(rows: TransitionBatch) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Numbers of the transitions that follow another in the same episode, and of those; episodes may be interleaved."""
+    order = np.argsort(rows.episodes, kind="stable")
+    earlier, later = order[:-1], order[1:]
+    same = (rows.episodes[later] == rows.episodes[earlier]) & _follow(rows, later, earlier)
+    return later[same], earlier[same]
+
+
+def _follow(rows: TransitionBatch, later: NDArray[np.int64], earlier: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which of the later transitions begin where the earlier ones end; looked at in parts."""
+    found = np.zeros(len(later), dtype=np.bool_)
+    for begin in range(0, len(later), PART):
+        part = slice(begin, begin + PART)
+        found[part] = (rows.before[later[part]] == rows.after[earlier[part]]).all(axis=1)
+    return found
+
+
+def steps_in_a_row(rows: TransitionBatch, most: int) -> tuple[TransitionBatch, TransitionBatch]:
+    """Evenly chosen transitions that follow another, and those that they follow."""
+    later, earlier = following_steps(rows)
+    some = np.linspace(0, len(later) - 1, min(len(later), most)).astype(np.int64) if len(later) else later
+    return rows.select(later[some]), rows.select(earlier[some])
+
+
+def with_past(
+    now: TransitionBatch, before: TransitionBatch, cardinalities: tuple[int, ...], acts: Acts, board: PlaneLayout | None
+) -> tuple[FactoredSpace, TransitionBatch]:
+    """Transitions that follow others, with the others' states and actions as part of their state.
+
+    Args:
+        now: the transitions.
+        before: those that they follow.
+        cardinalities: number of values of each factor.
+        acts: the actions.
+        board: where the factors are cells of planes; the past is further planes then.
+
+    Returns:
+        (the space of states with a past, the transitions).
+    """
+    shape: tuple[int, ...] = (len(cardinalities),) if board is None else (board.channels, board.height, board.width)
+
+    def laid_out(states: NDArray[np.int64]) -> NDArray[np.int64]:
+        return states if board is None else board.to_planes(states)
+
+    def shown(states: NDArray[np.int64], past: NDArray[np.int64], actions: NDArray[np.int64]) -> NDArray[np.int64]:
+        bits = shown_acts(acts, actions).astype(np.int64)
+        bits = bits if board is None else np.broadcast_to(bits[:, :, None, None], (*bits.shape, *shape[1:]))
+        return np.concatenate([laid_out(states), laid_out(past), bits], axis=1)
+
+    cards = laid_out(np.asarray(cardinalities)[None])[0]
+    twos = np.full((acts.n_columns, *shape[1:]), 2)
+    sizes = np.concatenate([cards, cards, twos])
+    space = FactoredSpace(spaces.MultiBinary(sizes.shape) if (sizes == 2).all() else spaces.MultiDiscrete(sizes))
+    states = space.encode(shown(now.states, before.states, before.actions))
+    following = space.encode(shown(now.next_states, now.states, now.actions))
+    return space, TransitionBatch(states, now.actions, following, now.terminated, now.rewards, now.episodes)

@@ -1,0 +1,411 @@
+"""The graph of expanded states, and the MDP of all states that a model can reach (paper section 2).
+
+The reachable MDP and the search tree are both such graphs: a state reached in two ways is one node. Nodes belong to *groups*: no
+edge leads from one group to another, so that the plan for one observation cannot depend on the others of its batch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.overloads import CompiledModel, Outcomes, outcomes, work_for
+from mbagent.models.protocol import Successors, TransitionModel
+from mbagent.models.systematic_sampling import start as grid_of
+from mbagent.types import Bools, Floats, Ints, Keys, States
+from mbagent_envs.jit import borrowed, compiled
+from mbagent_envs.random_keys import derive, mix
+
+FEWEST_SLOTS = 1024
+"""Places of the smallest hash table."""
+
+AT_ONCE = 16_384
+"""Successors that room is made for at once, unless one state may have more; a node takes 16 bytes for each action."""
+
+
+class GraphArrays(NamedTuple):
+    """What compiled kernels need of a graph, with room to grow; N nodes and M edges of them are in use.
+
+    Attributes:
+        states, groups, expanded, first, counts, left_out: see StateGraph, [room, ...].
+        reached: whether a node was reached by a transition that did not end the episode, bool [room].
+        tags: hash of each node's state and group, uint64 [room].
+        next_nodes, probabilities, terminated, sources, actions: see StateGraph, [room].
+        slots: hash table of the nodes, -1 where free, int64 [a power of two].
+        weights: of the hash, uint64 [F].
+        sizes: N and M, int64 [2].
+    """
+
+    states: States
+    groups: Ints
+    expanded: Bools
+    first: Ints
+    counts: Ints
+    left_out: Floats
+    reached: Bools
+    tags: Keys
+    next_nodes: Ints
+    probabilities: Floats
+    terminated: Bools
+    sources: Ints
+    actions: Ints
+    slots: Ints
+    weights: Keys
+    sizes: Ints
+
+
+@compiled
+def add_node(graph: GraphArrays, state: Ints, group: int) -> int:
+    """The node of a state [F] in a group; a new one where there is none. There must be room."""
+    total = np.uint64(0)
+    for f in range(len(state)):
+        total += np.uint64(state[f] + 1) * graph.weights[f]
+    tag, slots, sizes = mix(total ^ mix(np.uint64(group))), graph.slots, graph.sizes
+    place = np.int64(tag & np.uint64(len(slots) - 1))
+    while slots[place] >= 0:
+        if graph.tags[slots[place]] == tag:
+            return int(slots[place])
+        place = (place + 1) & (len(slots) - 1)
+    node = sizes[0]
+    slots[place] = node
+    graph.tags[node] = tag
+    graph.groups[node] = group
+    graph.expanded[node], graph.reached[node] = False, False
+    for f in range(len(state)):
+        graph.states[node, f] = state[f]
+    for a in range(graph.counts.shape[1]):
+        graph.first[node, a], graph.counts[node, a], graph.left_out[node, a] = 0, 0, 0.0
+    sizes[0] = node + 1
+    return int(node)
+
+
+@compiled
+def add_edge(graph: GraphArrays, source: int, action: int, state: Ints, terminated: bool, probability: float) -> int:
+    """Appends a successor of a (node, action), whose others were the last to be appended; returns its node."""
+    target, edge = add_node(graph, state, graph.groups[source]), graph.sizes[1]
+    graph.next_nodes[edge], graph.probabilities[edge], graph.terminated[edge] = target, probability, terminated
+    graph.sources[edge], graph.actions[edge] = source, action
+    if graph.counts[source, action] == 0:
+        graph.first[source, action] = edge
+    graph.counts[source, action] += 1
+    graph.reached[target] |= not terminated
+    graph.sizes[1] = edge + 1
+    return target
+
+
+@compiled
+def expand_with(
+    kernel: Any, work: Any, graph: GraphArrays, node: int, n_samples: int, key: np.uint64, offset: float, out: Outcomes
+) -> None:
+    """Appends all successors of a node, from a kernel."""
+    outcomes(kernel, work, graph.states[node], n_samples, key, offset, out)
+    i = 0
+    for action in range(len(out.counts)):
+        graph.left_out[node, action] = out.left_out[action]
+        for _ in range(out.counts[action]):
+            add_edge(graph, node, action, out.states[i], out.terminated[i], out.probabilities[i])
+            i += 1
+    graph.expanded[node] = True
+
+
+@compiled
+def most_outcomes(n_actions: int, n_samples: int) -> int:
+    """Outcomes that a state may have at most; see ``compiled_model.outcomes``."""
+    return 2 * n_actions * max(n_samples, 2)
+
+
+@compiled
+def room_for_outcomes(n_actions: int, n_factors: int, n_samples: int) -> Outcomes:
+    """Room for all that may follow a state."""
+    most = most_outcomes(n_actions, n_samples)
+    return Outcomes(
+        np.empty(n_actions, dtype=np.int64),
+        np.empty((most, n_factors), dtype=np.int64),
+        np.empty(most, dtype=np.bool_),
+        np.empty(most, dtype=np.float64),
+        np.zeros(n_actions, dtype=np.float64),
+    )
+
+
+@compiled
+def _expand_all(kernel: Any, graph: GraphArrays, nodes: Ints, n_samples: int, key: np.uint64, offset: float) -> int:
+    """Expands nodes [B] as long as there is room; returns how many."""
+    n_actions, most = graph.counts.shape[1], most_outcomes(graph.counts.shape[1], n_samples)
+    made = work_for(kernel, n_samples), room_for_outcomes(n_actions, graph.states.shape[1], n_samples)
+    lent, kernel, graph = borrowed(made), borrowed(kernel), borrowed(graph)
+    done = 0
+    for node in nodes:
+        if graph.sizes[0] + most > len(graph.states) or graph.sizes[1] + most > len(graph.sources):
+            break
+        expand_with(kernel, lent[0], graph, node, n_samples, key, offset, lent[1])
+        done += 1
+    return done + 0 * len(made[1].counts)  # what is lent must live until here
+
+
+@compiled
+def _append(graph: GraphArrays, nodes: Ints, offsets: Ints, states: States, terminated: Bools, probabilities: Floats) -> None:
+    """Appends successors that a model found: those of nodes[i] under action a are row i * A + a of the compressed rows."""
+    n_actions = graph.counts.shape[1]
+    for i in range(len(nodes)):
+        for a in range(n_actions):
+            for e in range(offsets[i * n_actions + a], offsets[i * n_actions + a + 1]):
+                add_edge(graph, nodes[i], a, states[e], terminated[e], probabilities[e])
+        graph.expanded[nodes[i]] = True
+
+
+@compiled
+def _add_all(graph: GraphArrays, states: States, groups: Ints, nodes: Ints) -> None:
+    for b in range(len(states)):
+        nodes[b] = add_node(graph, states[b], groups[b])
+
+
+@compiled
+def _find_all(graph: GraphArrays, states: States, group: int, nodes: Ints) -> None:
+    slots = graph.slots
+    for b in range(len(states)):
+        total = np.uint64(0)
+        for f in range(states.shape[1]):
+            total += np.uint64(states[b, f] + 1) * graph.weights[f]
+        tag = mix(total ^ mix(np.uint64(group)))
+        place = np.int64(tag & np.uint64(len(slots) - 1))
+        nodes[b] = -1
+        while slots[place] >= 0:
+            if graph.tags[slots[place]] == tag:
+                nodes[b] = slots[place]
+                break
+            place = (place + 1) & (len(slots) - 1)
+
+
+@compiled
+def _place_all(tags: Keys, slots: Ints) -> None:
+    """Fills an empty hash table."""
+    for node in range(len(tags)):
+        place = np.int64(tags[node] & np.uint64(len(slots) - 1))
+        while slots[place] >= 0:
+            place = (place + 1) & (len(slots) - 1)
+        slots[place] = node
+
+
+_NODE_FIELDS = ("states", "groups", "expanded", "first", "counts", "left_out", "reached", "tags")
+_EDGE_FIELDS = ("next_nodes", "probabilities", "terminated", "sources", "actions")
+
+
+class StateGraph:
+    """States, and for every expanded (state, action) its successors.
+
+    Shapes: N nodes, A actions, F factors, M successors in all. The successors of node i under action a lie at
+    ``first[i, a] : first[i, a] + count[i, a]`` of the successor arrays.
+
+    Args:
+        model: where successors come from.
+
+    Attributes (arrays are views of what is filled so far):
+        states: int64 [N, F]. groups: int64 [N]. expanded: bool [N].
+        first, counts: int64 [N, A].
+        left_out: float64 [N, A], probability of rare successors that others stand for, see ``particles.py``.
+        next_nodes: int64 [M]. probabilities: float64 [M]. terminated: bool [M].
+        sources: int64 [M], the node each successor comes from. actions: int64 [M].
+        arrays: the same for compiled kernels, with room to grow.
+        kernel: the model's arrays for compiled kernels; None where it has none.
+    """
+
+    def __init__(self, model: TransitionModel) -> None:
+        """See the class."""
+        self.model = model
+        self.kernel = model.kernel() if isinstance(model, CompiledModel) else None
+        n_factors, n_actions = len(model.cardinalities), model.n_actions
+        none = np.zeros(0, dtype=np.int64)
+        table, flags = np.zeros((0, n_actions), dtype=np.int64), np.zeros(0, dtype=np.bool_)
+        self.arrays = GraphArrays(
+            np.zeros((0, n_factors), dtype=np.int64), none, flags, table, table, table.astype(np.float64), flags,
+            none.astype(np.uint64),
+            none, none.astype(np.float64), flags, none, none,
+            np.full(FEWEST_SLOTS, -1, dtype=np.int64),
+            derive(np.arange(n_factors, dtype=np.uint64), 0x5851F42D) | np.uint64(1),
+            np.zeros(2, dtype=np.int64),
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        """Number of nodes N."""
+        return int(self.arrays.sizes[0])
+
+    @property
+    def n_edges(self) -> int:
+        """Number of successors M."""
+        return int(self.arrays.sizes[1])
+
+    def __getattr__(self, name: str) -> NDArray[Any]:
+        """Views of the arrays that are filled so far."""
+        if name in _NODE_FIELDS or name in _EDGE_FIELDS:
+            array: NDArray[Any] = getattr(self.arrays, name)
+            return array[: self.arrays.sizes[0 if name in _NODE_FIELDS else 1]]
+        raise AttributeError(name)
+
+    states: States
+    groups: Ints
+    expanded: Bools
+    first: Ints
+    counts: Ints
+    left_out: Floats
+    next_nodes: Ints
+    probabilities: Floats
+    terminated: Bools
+    sources: Ints
+    actions: Ints
+
+    def clear(self) -> None:
+        """Forgets all states; the room stays."""
+        self.arrays.slots.fill(-1)
+        self.arrays.sizes.fill(0)
+
+    def reserve(self, n_nodes: int, n_edges: int) -> None:
+        """Makes room for so many more nodes and edges."""
+        arrays = self.arrays
+        for extra, fields, used in ((n_nodes, _NODE_FIELDS, len(self)), (n_edges, _EDGE_FIELDS, self.n_edges)):
+            old = len(getattr(arrays, fields[0]))
+            if used + extra > old:
+                size = max(used + extra, 2 * old, 1024)
+                arrays = arrays._replace(**{name: _longer(getattr(arrays, name), used, size) for name in fields})
+        if 2 * len(arrays.tags) > len(arrays.slots):
+            slots = np.full(1 << (2 * len(arrays.tags) - 1).bit_length(), -1, dtype=np.int64)
+            _place_all(arrays.tags[: len(self)], slots)
+            arrays = arrays._replace(slots=slots)
+        self.arrays = arrays
+
+    def add(self, states: States, groups: Ints) -> Ints:
+        """Nodes [B] of the given states [B, F] in the given groups [B]; new ones are appended in order of appearance."""
+        self.reserve(len(states), 0)
+        nodes = np.empty(len(states), dtype=np.int64)
+        _add_all(self.arrays, np.ascontiguousarray(states, dtype=np.int64), groups, nodes)
+        return nodes
+
+    def find(self, states: States, group: int = 0) -> Ints:
+        """Nodes [B] of states [B, F] in one group, -1 where there is none."""
+        nodes = np.empty(len(states), dtype=np.int64)
+        _find_all(self.arrays, np.ascontiguousarray(states, dtype=np.int64), group, nodes)
+        return nodes
+
+    def expand(self, nodes: Ints, n_samples: int, seed: int) -> Ints:
+        """Asks the model for the successors of unexpanded, distinct ``nodes`` [B] under every action.
+
+        Returns:
+            the nodes that were new, in order of appearance, int64.
+        """
+        size = len(self)
+        if self.kernel is not None:
+            key, offset = grid_of(seed)
+            of_one = most_outcomes(self.model.n_actions, n_samples)
+            while len(nodes):
+                most = of_one * max(1, min(len(nodes), AT_ONCE // of_one))
+                self.reserve(most, most)
+                nodes = nodes[_expand_all(self.kernel, self.arrays, nodes, n_samples, key, offset) :]
+        elif len(nodes):
+            n_actions = self.model.n_actions
+            sources, actions = np.repeat(nodes, n_actions), np.tile(np.arange(n_actions), len(nodes))
+            self._append(nodes, self.model.successors(self.states[sources], actions, n_samples, seed))
+        return np.arange(size, len(self), dtype=np.int64)
+
+    def _append(self, nodes: Ints, found: Successors) -> None:
+        self.reserve(len(found.states), len(found.states))
+        states = np.ascontiguousarray(found.states, dtype=np.int64)
+        _append(self.arrays, nodes, found.offsets, states, found.terminated, found.probabilities)
+
+    def only_terminal(self, nodes: Ints) -> Bools:
+        """Whether each of the ``nodes`` [B] was reached by terminated transitions only: nothing comes after it."""
+        result: Bools = ~self.arrays.reached[nodes]
+        return result
+
+
+def _longer(array: NDArray[Any], used: int, size: int) -> NDArray[Any]:
+    """The first ``used`` rows, with room for ``size``: what was never written takes no memory yet."""
+    longer = np.empty((size, *array.shape[1:]), dtype=array.dtype)
+    longer[:used] = array[:used]
+    return longer
+
+
+@dataclass(frozen=True)
+class ReachableMDP:
+    """States, and for each (state, action) the successors with probability and terminated; no rewards.
+
+    Attributes:
+        states: int64 [N, F], the start states first.
+        offsets: int64 [N, A + 1]; successors of state i under action a are ``offsets[i, a] : offsets[i, a + 1]``.
+        next_states: int64 [M], indices of states.
+        probabilities: float64 [M].
+        terminated: bool [M].
+        complete: whether every reachable state was expanded within the budget. If not, the machine is partial: states
+            that were met but not expanded have no successors.
+    """
+
+    states: States
+    offsets: NDArray[np.int64]
+    next_states: NDArray[np.int64]
+    probabilities: Floats
+    terminated: Bools
+    complete: bool
+
+
+MOST_ROOM = 100_000_000
+"""Entries of a graph's tables of (state, action) that the outcomes of one state may make room for, 16 bytes each."""
+
+
+def grow_reachable(
+    model: TransitionModel, start: States, max_states: int, n_samples: int, seed: int = 0
+) -> tuple[StateGraph, bool]:
+    """Expands states breadth-first from ``start`` until none is left or ``max_states`` are expanded.
+
+    Args:
+        model: the model to imagine with.
+        start: int64 [B, F].
+        max_states: number of states expanded at most.
+        n_samples: draws for a (state, action) with too many successors to enumerate; fewer where there are so many actions
+            that room for their outcomes would be too large.
+        seed: which random numbers those draws use.
+
+    Returns:
+        (graph with one group 0, whether every reachable state was expanded).
+    """
+    n_samples = max(1, min(n_samples, MOST_ROOM // (2 * model.n_actions**2)))
+    graph = StateGraph(model)
+    layer = np.unique(graph.add(start, np.zeros(len(start), dtype=np.int64)))
+    expanded = 0
+    while len(layer):
+        layer = layer[: max_states - expanded]
+        if len(layer) == 0:
+            return graph, False
+        expanded += len(layer)
+        graph.expand(layer, n_samples, seed)
+        waiting = np.flatnonzero(~graph.expanded)
+        layer = waiting[~graph.only_terminal(waiting)]
+    return graph, True
+
+
+def reachable_mdp(
+    model: TransitionModel, start: States, max_states: int = 10_000, n_samples: int = 32, seed: int = 0
+) -> ReachableMDP:
+    """The machine reachable from ``start`` int64 [B, F], as plain arrays; see ``grow_reachable`` for the arguments.
+
+    Where more than ``max_states`` states can be reached, the nearest ones are expanded and ``complete`` is False.
+
+    Raises:
+        ValueError: a budget of no states or no draws, or no start state.
+    """
+    for name, value in (("max_states", max_states), ("n_samples", n_samples), ("the number of start states", len(start))):
+        if value < 1:
+            raise ValueError(f"A machine needs at least one of each, but {name} is {value}; give 1 or more.")
+    graph, complete = grow_reachable(model, start, max_states, n_samples, seed)
+    order = np.lexsort((graph.actions, graph.sources))
+    counts = graph.counts
+    ends = np.cumsum(counts.ravel()).reshape(counts.shape)
+    starts = ends[:, :1] - counts[:, :1]
+    return ReachableMDP(
+        states=graph.states.copy(),
+        offsets=np.concatenate([starts, ends], axis=1),
+        next_states=graph.next_nodes[order],
+        probabilities=graph.probabilities[order],
+        terminated=graph.terminated[order],
+        complete=complete,
+    )

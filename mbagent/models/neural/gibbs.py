@@ -1,0 +1,420 @@
+"""Gibbs sampling of outcomes, compiled: the paper's sweeps (3.2), which redraw each factor given all others.
+
+A block of rows begins with the predictor's first guess and with the summed inputs of the factors that are uncertain.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mbagent.models.neural.kernels import (
+    Floats32,
+    GroupWeights,
+    Layout,
+    active_columns,
+    add_columns,
+    add_scaled,
+    copy_row,
+    count_below,
+    finish,
+    largest,
+    trusted,
+)
+from mbagent.models.neural.sampling import draw_at
+from mbagent.models.systematic_sampling import draw
+from mbagent.types import Floats, Ints, Keys
+from mbagent_envs.jit import borrowed, compiled, inlined, vectorised
+from mbagent_envs.random_keys import derive_one, fill_row
+
+LEEWAY = 2.0
+"""The conditioner is taken to raise the odds of an unlikely value of a trusted factor at most so many times."""
+
+ROWS = 64
+"""Rows that are worked on together, at most."""
+
+SUMS = 2**15
+"""Numbers in the summed inputs of all open factors of these rows, at most: more would not stay in the processor's cache."""
+
+ALWAYS = 2.0
+"""A bound that no random number reaches: as ``low`` it marks an open factor."""
+
+
+class Block(NamedTuple):
+    """R rows; C columns of the next factors.
+
+    Attributes:
+        guess: the next factors' columns, [R, C].
+        low: the conditioner is asked about a factor when its number is below this, [R, O].
+        high: or at least this, [R, O]; in between the factor is what the predictor thinks likeliest.
+        top: which value that is, int64 [R, O].
+        slot: where the sums of an open factor are, -1 where it is not open, int64 [R, O].
+        columns: all columns that are on at first, int64 [R, C + O + n_steps].
+        n_columns: how many, int64 [R].
+        sums: input of the groups of open factors, [slots, G]; the last is for any other factor.
+    """
+
+    guess: Floats32
+    low: Floats
+    high: Floats
+    top: Ints
+    slot: Ints
+    columns: Ints
+    n_columns: Ints
+    sums: Floats32
+
+
+class SweepWork(NamedTuple):
+    """Work space for one row.
+
+    Attributes:
+        active: input columns that are on, int64 [O + n_steps].
+        on: 1 where a column is on in the state, int64 [C].
+        columns: all columns that are on now, int64 [C + O + n_steps].
+        shift: from a column to its place among a group's, by whether it is on in the state and in the next one, int64 [4].
+        chosen: factors that this sweep may change, int64 [O].
+        luck: a number for each factor, [O].
+        rank: another one, which orders them, [O].
+        ranks: that of the chosen ones, [O].
+        order: the chosen ones in that order, int64 [O].
+        hidden: nodes of one group, [1, G].
+        row_logits: of one factor, [K].
+        given: its distribution, [K].
+    """
+
+    active: Ints
+    on: Ints
+    columns: Ints
+    shift: Ints
+    chosen: Ints
+    luck: Floats
+    rank: Floats
+    ranks: Floats
+    order: Ints
+    hidden: Floats32
+    row_logits: Floats32
+    given: Floats
+
+
+@compiled
+def work_space(n_rows: int, layout: Layout, group: GroupWeights) -> tuple[Block, SweepWork]:
+    """Room for a block, and for a row, of ``n_rows`` rows of a model of this shape."""
+    n_outputs, size, n_values = len(layout.outputs), group.bias.shape[1], group.offset.shape[1]
+    n_columns, n_active, rows = group.both_start - group.next_start, n_outputs + layout.n_steps, min(n_rows, ROWS)
+    n_slots = 1 + max(n_outputs, min(rows * n_outputs, SUMS // size))
+    block = Block(
+        np.empty((rows, n_columns), dtype=np.float32),
+        np.empty((rows, n_outputs), dtype=np.float64),
+        np.empty((rows, n_outputs), dtype=np.float64),
+        np.empty((rows, n_outputs), dtype=np.int64),
+        np.empty((rows, n_outputs), dtype=np.int64),
+        np.empty((rows, n_columns + n_active), dtype=np.int64),
+        np.empty(rows, dtype=np.int64),
+        np.empty((n_slots, size), dtype=np.float32),
+    )
+    work = SweepWork(
+        np.empty(n_active, dtype=np.int64),
+        np.empty(n_columns, dtype=np.int64),
+        np.empty(n_columns + n_active, dtype=np.int64),
+        np.array((0, 0, group.next_start, group.both_start), dtype=np.int64),
+        np.empty(n_outputs, dtype=np.int64),
+        np.empty(n_outputs, dtype=np.float64),
+        np.empty(n_outputs, dtype=np.float64),
+        np.empty(n_outputs, dtype=np.float64),
+        np.empty(n_outputs, dtype=np.int64),
+        np.empty((1, size), dtype=np.float32),
+        np.empty(n_values, dtype=np.float32),
+        np.empty(n_values, dtype=np.float64),
+    )
+    return block, work
+
+
+@compiled
+def begin_block(
+    first: int,
+    states: Ints,
+    actions: Ints,
+    probs: Floats,
+    keys: Keys,
+    layout: Layout,
+    group: GroupWeights,
+    certain: float,
+    real_guess: bool,
+    block: Block,
+    work: SweepWork,
+    factors: Ints,
+) -> int:
+    """Begins rows from ``first`` on, while there is room for the sums of their open factors; returns how many."""
+    # The caller keeps all of this alive: no references need be counted for every factor.
+    states, probs, factors = borrowed(states), borrowed(probs), borrowed(factors)
+    layout, group, k, w = borrowed(layout), borrowed(group), borrowed(block), borrowed(work)
+    n_slots = 0
+    for r in range(min(len(states) - first, len(k.low))):
+        b, n_open = first + r, 0
+        fill_row(keys[b], w.luck)
+        if probs.shape[2] == 2:
+            _draw_bits(probs, b, w.luck, factors)
+            _bound_bits(probs, b, r, group.group_of, certain, k.low, k.high)
+            _likeliest_bits(probs, b, r, group.group_of, factors, k.top)
+            _show_bits(probs, b, r, factors, k.low, real_guess, k.guess)
+        else:
+            for i in range(len(layout.outputs)):
+                _begin_factor(b, r, i, probs, layout, group, certain, real_guess, k, w, factors)
+        for i in range(len(layout.outputs)):
+            is_open = k.low[r, i] == ALWAYS
+            k.slot[r, i] = n_slots + n_open if is_open else -1
+            n_open += int(is_open)
+        if n_slots + n_open >= len(k.sums):
+            return r  # this row is begun again in the next block
+        n_slots += n_open
+        k.n_columns[r] = list_columns(b, r, states, actions[b], layout, k, w, k.columns[r])
+    return min(len(states) - first, len(k.low))
+
+
+@vectorised
+def _draw_bits(probs: Floats, b: int, luck: Floats, factors: Ints) -> None:
+    """The first guess of row b where all factors are bits; this and the next three are apart so that each is one vector loop."""
+    for i in range(len(luck)):
+        factors[b, i] = int((luck[i] >= probs[b, i, 0]) & (probs[b, i, 1] > 0.0))
+
+
+@vectorised
+def _bound_bits(probs: Floats, b: int, r: int, group_of: Ints, certain: float, low: Floats, high: Floats) -> None:
+    """As ``_begin_factor`` sets ``low`` and ``high``."""
+    for i in range(low.shape[1]):
+        p0, p1 = probs[b, i, 0], probs[b, i, 1]
+        trust = (max(p0, p1) >= certain) | (group_of[i] < 0)
+        below = LEEWAY * p0 if (p1 > p0) & (group_of[i] >= 0) else 0.0
+        above = LEEWAY * p1 if (p1 <= p0) & (group_of[i] >= 0) else 0.0
+        low[r, i] = below if trust else ALWAYS
+        high[r, i] = 1.0 - above if trust else ALWAYS
+
+
+@vectorised
+def _likeliest_bits(probs: Floats, b: int, r: int, group_of: Ints, factors: Ints, top: Ints) -> None:
+    """As ``_begin_factor`` sets ``top``."""
+    for i in range(top.shape[1]):
+        likeliest = int(probs[b, i, 1] > probs[b, i, 0])
+        top[r, i] = likeliest if group_of[i] >= 0 else factors[b, i]
+
+
+@vectorised
+def _show_bits(probs: Floats, b: int, r: int, factors: Ints, low: Floats, real_guess: bool, guess: Floats32) -> None:
+    """As ``_begin_factor`` sets ``guess``."""
+    for i in range(guess.shape[1]):
+        real = real_guess & (low[r, i] == ALWAYS)
+        guess[r, i] = np.float32(probs[b, i, 1] if real else float(factors[b, i]))
+
+
+@inlined
+def _begin_factor(
+    b: int,
+    r: int,
+    i: int,
+    probs: Floats,
+    layout: Layout,
+    group: GroupWeights,
+    certain: float,
+    real_guess: bool,
+    k: Block,
+    w: SweepWork,
+    factors: Ints,
+) -> None:
+    """Draws the first guess of factor i, and says when the conditioner is to be asked about it."""
+    n, start, top = layout.outputs[i], layout.start[i], largest(probs, b, i, layout.outputs[i])
+    value = draw_at(probs, b, i, n, w.luck[i])
+    trust = trusted(probs, b, i, layout, group, certain)
+    below = 0.0
+    for v in range(top):
+        below += probs[b, i, v]
+    above = max(1.0 - probs[b, i, top] - below, 0.0)
+    factors[b, i], k.top[r, i] = value, top
+    k.low[r, i], k.high[r, i] = (LEEWAY * below, 1.0 - LEEWAY * above) if trust else (ALWAYS, ALWAYS)
+    if group.group_of[i] < 0:
+        k.top[r, i], k.low[r, i], k.high[r, i] = value, 0.0, ALWAYS
+    for v in range(n):
+        k.guess[r, start + v] = probs[b, i, v] if real_guess and not trust else float(int(value == v))
+
+
+@inlined
+def list_columns(b: int, r: int, states: Ints, action: int, layout: Layout, k: Block, w: SweepWork, columns: Ints) -> int:
+    """Lists the columns of row b that are on and returns how many; without branches, since bits cannot be foretold."""
+    n_active, n = active_columns(states, b, action, layout, w.active), 0
+    w.on[:] = 0
+    for a in range(n_active - layout.n_steps):
+        w.on[w.active[a]] = 1
+    for column in range(len(w.on)):
+        kind = w.on[column] + 2 * int(k.guess[r, column] == 1.0)
+        columns[n] = column + w.shift[kind]
+        n += int(kind > 0)
+    for a in range(n_active - layout.n_steps, n_active):
+        columns[n] = w.active[a]
+        n += 1
+    return n
+
+
+@inlined
+def sum_columns(
+    i: int, r: int, columns: Ints, n_columns: int, group: GroupWeights, real_guess: bool, k: Block, slot: int
+) -> None:
+    """Writes the summed input of factor i's group to ``k.sums[slot]``.
+
+    Args:
+        i: the factor.
+        r: row of the block.
+        columns: that are on.
+        n_columns: how many.
+        group: the conditioner.
+        real_guess: whether some may be on by a part.
+        k: the block.
+        slot: where.
+    """
+    g = group.group_of[i]
+    copy_row(group.bias, g, k.sums, slot)
+    add_columns(group.columns, g, columns, n_columns, k.sums, slot)
+    if real_guess:
+        for column in range(k.guess.shape[1]):
+            if 0.0 < k.guess[r, column] < 1.0:
+                add_scaled(group.columns, g, group.next_start + column, k.guess[r, column], k.sums, slot)
+
+
+@compiled
+def sum_up(n_rows: int, layout: Layout, group: GroupWeights, real_guess: bool, block: Block) -> None:
+    """Sums up the inputs of all open factors under the first guess: group after group, each for all rows while it is at hand."""
+    layout, group, k = borrowed(layout), borrowed(group), borrowed(block)
+    for i in range(len(layout.outputs)):
+        for r in range(n_rows):
+            if k.slot[r, i] >= 0:
+                sum_columns(i, r, k.columns[r], k.n_columns[r], group, real_guess, k, k.slot[r, i])
+
+
+_ORDER = np.uint64(1 << 32)
+"""Salt of a sweep's random order; its draws use the numbers of the factors, which are smaller."""
+
+
+@inlined
+def _shuffle(n: int, key: np.uint64, w: SweepWork) -> None:
+    """Lists the first ``n`` of ``w.chosen`` in a random order, in ``w.order``.
+
+    Any two come in the same order whichever others are there: sweeps over some of the factors are like those over all. Each one's
+    place is how many come before it, counted without branches: those of a sort could not be foretold.
+    """
+    fill_row(key, w.rank)
+    for step in range(n):
+        w.ranks[step] = w.rank[w.chosen[step]]
+    for step in range(n):
+        place = count_below(w.ranks, 0, step, w.ranks[step], True) + count_below(w.ranks, step + 1, n, w.ranks[step], False)
+        w.order[place] = w.chosen[step]
+
+
+@compiled
+def sample_sweeps(
+    states: Ints,
+    actions: Ints,
+    logits: Floats32,
+    probs: Floats,
+    keys: Keys,
+    layout: Layout,
+    group: GroupWeights,
+    certain: float,
+    sweeps: int,
+    real_guess: bool,
+) -> Ints:
+    """The paper's procedure: the predictor's guess, then ``sweeps`` passes that redraw each factor given all others.
+
+    Args:
+        states: int64 [B, F].
+        actions: int64 [B].
+        logits: the predictor's, float32 [B, O, K].
+        probs: the predictor's, float64 [B, O, K].
+        keys: uint64 [B].
+        layout: the factors.
+        group: the conditioner, masked "others".
+        certain: a factor whose likeliest value has this probability in the predictor's eyes takes that value in every sweep,
+            without the conditioner, unless the number drawn for it lies so far out that the conditioner could say otherwise
+            by raising the odds ``LEEWAY`` times. Where it never raises them more, the draws are those of the full sweep.
+        sweeps: passes; each in a random order of its own.
+        real_guess: the first guess is the predictor's probabilities; else bits drawn from them.
+
+    Returns:
+        Draws int64 [B, O].
+    """
+    factors = np.empty((len(states), len(layout.outputs)), dtype=np.int64)
+    block, work = work_space(len(states), layout, group)
+    first = 0
+    while first < len(states):
+        n_rows = begin_block(first, states, actions, probs, keys, layout, group, certain, real_guess, block, work, factors)
+        sum_up(n_rows, layout, group, real_guess, block)
+        for r in range(n_rows):
+            b = first + r
+            _sweep_row(b, r, states, actions[b], logits, keys[b], layout, group, sweeps, real_guess, block, work, factors)
+        first += n_rows
+    return factors
+
+
+@compiled
+def _sweep_row(
+    b: int,
+    r: int,
+    states: Ints,
+    action: int,
+    logits: Floats32,
+    row_key: np.uint64,
+    layout: Layout,
+    group: GroupWeights,
+    sweeps: int,
+    real_guess: bool,
+    block: Block,
+    work: SweepWork,
+    factors: Ints,
+) -> None:
+    """The sweeps of row b, r of its block, to ``factors`` [B, O]."""
+    states, logits, factors = borrowed(states), borrowed(logits), borrowed(factors)
+    layout, group, k, w = borrowed(layout), borrowed(group), borrowed(block), borrowed(work)
+    for sweep in range(sweeps):
+        key, anew = derive_one(row_key, np.uint64(sweep)), real_guess and sweep == 0
+        fill_row(key, w.luck)
+        n = _choose(b, r, k, w, factors)
+        _shuffle(n, derive_one(key, _ORDER), w)
+        for step in range(n):
+            i = w.order[step]
+            u, value, slot = w.luck[i], k.top[r, i], k.slot[r, i]
+            if u < k.low[r, i] or u >= k.high[r, i]:
+                if slot < 0:
+                    slot = len(k.sums) - 1
+                    n_columns = list_columns(b, r, states, action, layout, k, w, w.columns)
+                    sum_columns(i, r, w.columns, n_columns, group, anew, k, slot)
+                finish(b, i, logits, layout, group, k.sums, slot, w.hidden, w.row_logits, w.given)
+                value = draw(w.given, layout.outputs[i], u)
+            if value != factors[b, i] or anew:
+                factors[b, i] = value
+                _change(r, i, value, step + 1 if sweep == sweeps - 1 else 0, n, layout, group, k, w)
+
+
+@inlined
+def _choose(b: int, r: int, k: Block, w: SweepWork, factors: Ints) -> int:
+    """Writes the factors that this sweep may change to ``w.chosen``; returns how many."""
+    n = 0
+    for i in range(len(w.luck)):
+        w.chosen[n] = i
+        n += int((w.luck[i] < k.low[r, i]) | (w.luck[i] >= k.high[r, i]) | (factors[b, i] != k.top[r, i]))
+    return n
+
+
+@inlined
+def _change(
+    r: int, i: int, value: int, begin: int, end: int, layout: Layout, group: GroupWeights, k: Block, w: SweepWork
+) -> None:
+    """Writes factor i's value to its columns, and what that changes to the sums of the open factors from ``begin`` on."""
+    n = layout.outputs[i]
+    for v in range(1 if n == 2 else 0, n):
+        column = layout.start[i] + (0 if n == 2 else v)
+        difference = np.float32(int(value == v)) - k.guess[r, column]
+        k.guess[r, column] = float(int(value == v))
+        if difference != 0.0:
+            for step in range(begin, end):
+                slot = k.slot[r, w.order[step]]
+                if slot >= 0:
+                    g = group.group_of[w.order[step]]
+                    add_scaled(group.columns, g, group.next_start + column, difference, k.sums, slot)

@@ -1,0 +1,533 @@
+"""Compiled inference of the networks of ``networks.py``, row by row, and the loops that it spends its time in.
+
+Torch trains; here each row of a batch is computed by itself, in one fixed order of operations. So a row's result is the same to
+the last bit alone and in any batch, which matrix products do not promise, and inputs that are 0 cost nothing.
+Shapes: B batch, F state factors, O = F + 1 output factors, K largest cardinality, G hidden nodes in a group, g groups.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.types import Floats, Ints
+from mbagent_envs.jit import compiled, inlined, vectorised
+
+Floats32 = NDArray[np.float32]
+
+SIGMOID, RELU, SILU, TANH, LINEAR = 0, 1, 2, 3, 4
+ACTIVATION_CODES = {"sigmoid": SIGMOID, "relu": RELU, "silu": SILU, "tanh": TANH}
+
+_PER_LN2 = np.float32(1.44269504)
+_LN2_HIGH, _LN2_LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
+_HALF, _ONE, _TWO = np.float32(0.5), np.float32(1.0), np.float32(2.0)
+_LOWEST, _HIGHEST = np.float32(-87.0), np.float32(88.0)
+_P0, _P1, _P2 = np.float32(1.9875691500e-4), np.float32(1.3981999507e-3), np.float32(8.3334519073e-3)
+_P3, _P4, _P5 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1), np.float32(5.0000001201e-1)
+
+
+@compiled
+def exp32(x: np.float32) -> np.float32:
+    """e^x to 7e-8 of its size, for x from -87 to 88 and as at these ends beyond: of the library's function no vectors are made.
+
+    2^n times a polynomial (Moshier's Cephes library, ``expf``); n goes straight to the exponent's place among the bits.
+    """
+    x = _LOWEST if x < _LOWEST else x
+    x = _HIGHEST if x > _HIGHEST else x
+    n = np.floor(x * _PER_LN2 + _HALF)
+    r = (x - n * _LN2_HIGH) - n * _LN2_LOW
+    series = ((((_P0 * r + _P1) * r + _P2) * r + _P3) * r + _P4) * r + _P5
+    power = np.int32((np.int32(n) + 127) << 23).view(np.float32)
+    return np.float32(((series * r) * r + r + _ONE) * power)
+
+
+_T0, _T1, _T2, _T3, _T4, _T5, _T6 = (1.0 / math.factorial(k) for k in range(7))
+_T7, _T8, _T9, _T10, _T11, _T12, _T13 = (1.0 / math.factorial(k) for k in range(7, 14))
+_WIDE_HIGH, _WIDE_LOW = 6.93145751953125e-1, 1.42860682030941723212e-6
+
+
+@compiled
+def exp64(x: float) -> float:
+    """As ``exp32`` in double precision, to 4e-16 of its size, for x from -708 to 0; below as at -708."""
+    x = max(x, -708.0)
+    n = np.floor(x * 1.4426950408889634 + 0.5)
+    r = (x - n * _WIDE_HIGH) - n * _WIDE_LOW
+    small = ((((((_T13 * r + _T12) * r + _T11) * r + _T10) * r + _T9) * r + _T8) * r + _T7) * r
+    series = ((((((small + _T6) * r + _T5) * r + _T4) * r + _T3) * r + _T2) * r + _T1) * r + _T0
+    return float(series * np.int64((np.int64(n) + 1023) << 52).view(np.float64))
+
+
+@vectorised
+def activate(table: Floats32, row: int, n: int, code: int) -> None:
+    """Applies the activation of this code to the first ``n`` values of ``table[row]``, in place."""
+    if code == RELU:
+        for h in range(n):
+            table[row, h] = max(table[row, h], np.float32(0.0))
+    elif code == SILU:
+        for h in range(n):
+            table[row, h] = table[row, h] / (_ONE + exp32(-table[row, h]))
+    elif code == SIGMOID:
+        for h in range(n):
+            table[row, h] = _ONE / (_ONE + exp32(-table[row, h]))
+    else:
+        for h in range(n):
+            table[row, h] = _ONE - _TWO / (_ONE + exp32(_TWO * table[row, h]))
+
+
+@vectorised
+def add_rows(table: Floats32, rows: Ints, n_rows: int, out: Floats32, row: int) -> None:
+    """Adds the first ``n_rows`` of ``rows`` of ``table`` [rows, G] to ``out[row]`` [G]; see ``add_columns``."""
+    c = 0
+    while c + 4 <= n_rows:
+        c0, c1, c2, c3 = rows[c], rows[c + 1], rows[c + 2], rows[c + 3]
+        for h in range(table.shape[1]):
+            out[row, h] += (table[c0, h] + table[c1, h]) + (table[c2, h] + table[c3, h])
+        c += 4
+    while c < n_rows:
+        for h in range(table.shape[1]):
+            out[row, h] += table[rows[c], h]
+        c += 1
+
+
+@vectorised
+def add_products(values: Floats32, n_rows: int, n_values: int, weights: Floats32, out: Floats32) -> None:
+    """Adds ``weights`` [4 * m, H] times the first ``n_values`` of ``values`` [R, H] to ``n_rows`` rows of ``out`` [R, 4 * m].
+
+    Four sums at a time: each of ``values`` is read a quarter as often. All rows one after another with the same weights, while
+    these are at hand; what is computed of a row does not depend on that.
+    """
+    for k in range(0, weights.shape[0], 4):
+        for r in range(n_rows):
+            s0 = s1 = s2 = s3 = np.float32(0.0)
+            for h in range(n_values):
+                value = values[r, h]
+                s0 += value * weights[k, h]
+                s1 += value * weights[k + 1, h]
+                s2 += value * weights[k + 2, h]
+                s3 += value * weights[k + 3, h]
+            out[r, k] += s0
+            out[r, k + 1] += s1
+            out[r, k + 2] += s2
+            out[r, k + 3] += s3
+
+
+@vectorised
+def add_columns(table: Floats32, g: int, columns: Ints, n_columns: int, sums: Floats32, row: int) -> None:
+    """Adds to ``sums[row]`` [G] what group g gets from the first ``n_columns`` of ``columns``; ``table`` is [g, columns, G].
+
+    Four columns at a time, which halves the time: ``sums`` is read and written a quarter as often.
+    """
+    c = 0
+    while c + 4 <= n_columns:
+        c0, c1, c2, c3 = columns[c], columns[c + 1], columns[c + 2], columns[c + 3]
+        for h in range(table.shape[2]):
+            sums[row, h] += (table[g, c0, h] + table[g, c1, h]) + (table[g, c2, h] + table[g, c3, h])
+        c += 4
+    while c < n_columns:
+        column = columns[c]
+        for h in range(table.shape[2]):
+            sums[row, h] += table[g, column, h]
+        c += 1
+
+
+@vectorised
+def add_scaled(table: Floats32, g: int, column: int, scale: np.float32, sums: Floats32, row: int) -> None:
+    """Adds to ``sums[row]`` [G] what group g gets from one column of ``table`` [g, columns, G], times ``scale``."""
+    for h in range(table.shape[2]):
+        sums[row, h] += scale * table[g, column, h]
+
+
+@vectorised
+def copy_row(table: Floats32, row: int, out: Floats32, out_row: int) -> None:
+    """Copies ``table[row]`` to ``out[out_row]``, without slices, which cost more."""
+    for h in range(table.shape[1]):
+        out[out_row, h] = table[row, h]
+
+
+@vectorised
+def count_below(values: Floats, begin: int, end: int, limit: float, or_equal: bool) -> int:
+    """How many of ``values[begin:end]`` are below a limit, or equal to it."""
+    n = 0
+    if or_equal:
+        for i in range(begin, end):
+            n += int(values[i] <= limit)
+    else:
+        for i in range(begin, end):
+            n += int(values[i] < limit)
+    return n
+
+
+@vectorised
+def product(sums: Floats32, row: int, code: int, table: Floats32, g: int, k: int) -> np.float32:
+    """The activations of ``sums[row]`` [G] times ``table[g, k]`` [G]."""
+    total = np.float32(0.0)
+    if code == RELU:
+        for h in range(table.shape[2]):
+            total += max(sums[row, h], np.float32(0.0)) * table[g, k, h]
+    elif code == SILU:
+        for h in range(table.shape[2]):
+            total += sums[row, h] / (_ONE + exp32(-sums[row, h])) * table[g, k, h]
+    elif code == SIGMOID:
+        for h in range(table.shape[2]):
+            total += table[g, k, h] / (_ONE + exp32(-sums[row, h]))
+    elif code == TANH:
+        for h in range(table.shape[2]):
+            total += (_ONE - _TWO / (_ONE + exp32(_TWO * sums[row, h]))) * table[g, k, h]
+    else:
+        for h in range(table.shape[2]):
+            total += sums[row, h] * table[g, k, h]
+    return total
+
+
+@inlined
+def softmax(logits: Floats32, n: int, out: Floats) -> None:
+    """Writes the distribution over the first ``n`` values to ``out``."""
+    if n == 2:  # one exponential instead of two: bits are the common case
+        difference = np.float64(logits[1]) - np.float64(logits[0])
+        small = math.exp(-abs(difference))
+        large = 1.0 / (1.0 + small)
+        out[0] = small * large if difference > 0 else large
+        out[1] = large if difference > 0 else small * large
+        return
+    top = np.float64(logits[0])
+    for k in range(1, n):
+        top = max(top, np.float64(logits[k]))
+    total = 0.0
+    for k in range(n):
+        out[k] = math.exp(np.float64(logits[k]) - top)
+        total += out[k]
+    for k in range(n):
+        out[k] /= total
+
+
+@vectorised
+def write_bits(columns: Floats32, row: int, logits: Floats32, b: int) -> None:
+    """Writes row b of ``logits`` [B, O, 2] where all factors are bits, from ``columns[row]`` [O or more]; the logit of 0 is 0."""
+    for i in range(logits.shape[1]):
+        logits[b, i, 0] = np.float32(0.0)
+        logits[b, i, 1] = columns[row, i]
+
+
+@vectorised
+def add_signed(states: Ints, b: int, weights: Floats32, row: int, out: Floats32, out_row: int) -> None:
+    """Adds ``weights[row]`` [F] to ``out[out_row]`` where the bits ``states[b]`` [F] are 1, and subtracts it where they are 0."""
+    for i in range(states.shape[1]):
+        out[out_row, i] += np.float32(2 * states[b, i] - 1) * weights[row, i]
+
+
+@vectorised
+def _bit_probabilities(logits: Floats32, b: int, out: Floats) -> None:
+    """Row b of ``probabilities`` where all factors are bits."""
+    for i in range(logits.shape[1]):
+        difference = np.float64(logits[b, i, 1]) - np.float64(logits[b, i, 0])
+        small = exp64(-abs(difference))
+        large = 1.0 / (1.0 + small)
+        small *= large
+        out[b, i, 0] = small if difference > 0 else large
+        out[b, i, 1] = large if difference > 0 else small
+
+
+@compiled
+def probabilities(logits: Floats32, outputs: Ints) -> Floats:
+    """Each factor's distribution, float64 [B, O, K], from logits [B, O, K]; 0 for values a factor lacks."""
+    out = np.zeros(logits.shape, dtype=np.float64)
+    row_logits = np.empty(logits.shape[2], dtype=np.float32)
+    row = np.empty(logits.shape[2], dtype=np.float64)
+    for b in range(logits.shape[0]):
+        if logits.shape[2] == 2:
+            _bit_probabilities(logits, b, out)
+            continue
+        for i in range(logits.shape[1]):
+            n = outputs[i]
+            for k in range(n):
+                row_logits[k] = logits[b, i, k]
+            softmax(row_logits, n, row)
+            for k in range(n):
+                out[b, i, k] = row[k]
+    return out
+
+
+ROWS = 32
+"""Rows of a batch that a predictor's layers are applied to one after another, with the same weights at hand."""
+
+
+class Layout(NamedTuple):
+    """Where factors lie among columns.
+
+    Attributes:
+        outputs: cardinalities of the output factors, int64 [O]; the first F are the state's.
+        start: first column of each output factor, int64 [O].
+        n_state_columns: columns of the state; those of the action follow.
+        n_actions: actions A of a single step.
+        n_steps: actions in a string, see ``FactorCodec``.
+    """
+
+    outputs: Ints
+    start: Ints
+    n_state_columns: int
+    n_actions: int
+    n_steps: int
+
+
+class DenseWeights(NamedTuple):
+    """A ``DensePredictor``: L hidden layers, padded to the widest of them, H; C output columns, padded to a multiple of four.
+
+    Attributes:
+        first: from (state, action) columns, [n_inputs, H] (L = 0: [n_inputs, C]).
+        inner: to hidden layers 1 ... L - 1 from those before, [max(L - 1, 0), H to, H from].
+        bias: of the hidden layers, [L, H].
+        sizes: of the hidden layers with padding, a multiple of ``packing.LANES``, int64 [L].
+        to_columns: to the output columns, [C, H].
+        column_bias: [C].
+        stay: the residual path's, [n_steps * A, n_state_columns]; zero where there is none.
+        n_columns: output columns without padding.
+        activation: one of the codes of ``arithmetic.py``.
+    """
+
+    first: Floats32
+    inner: Floats32
+    bias: Floats32
+    sizes: Ints
+    to_columns: Floats32
+    column_bias: Floats32
+    stay: Floats32
+    n_columns: int
+    activation: int
+
+    @property
+    def last(self) -> Floats32:
+        """``to_columns`` without padding, [H, n_columns]."""
+        return self.to_columns[: self.n_columns].T
+
+    @property
+    def last_bias(self) -> Floats32:
+        """``column_bias`` without padding, [n_columns]."""
+        return self.column_bias[: self.n_columns]
+
+
+class GroupWeights(NamedTuple):
+    """A ``Conditioner`` with g groups.
+
+    Attributes:
+        group_of: group of each output factor, -1 where it has none, int64 [O].
+        columns: weights from all columns, [g, n_inputs + n_columns + n_state_columns, G]: of state and action, of the next
+            factors (zero where pruned), and of the state's columns that are on in the state and in the next one, too. Most
+            columns are alike in both: one addition does for two then.
+        bias: [g, G].
+        to_values: to the logits of the group's factor, [g, K, G]; of a bit, the logit of 0 is 0.
+        offset: [g, K].
+        next_start: place of the next factors' columns, n_inputs.
+        both_start: place of those that are on in both, n_inputs + n_columns.
+        activation: one of the codes of ``arithmetic.py``.
+        correction: whether the predictor's logits are added.
+    """
+
+    group_of: Ints
+    columns: Floats32
+    bias: Floats32
+    to_values: Floats32
+    offset: Floats32
+    next_start: int
+    both_start: int
+    activation: int
+    correction: bool
+
+    @property
+    def inputs(self) -> Floats32:
+        """From (state, action) columns, [g, n_inputs, G]."""
+        return self.columns[:, : self.next_start]
+
+    @property
+    def others(self) -> Floats32:
+        """From the next factors' columns, [g, n_columns, G]."""
+        return self.columns[:, self.next_start : self.both_start]
+
+    @property
+    def readout(self) -> Floats32:
+        """``to_values`` as [g, G, K]."""
+        return self.to_values.transpose(0, 2, 1)
+
+
+@inlined
+def active_columns(states: Ints, b: int, action: int, layout: Layout, out: Ints) -> int:
+    """Writes the input columns of row b that are 1 to ``out`` [F + n_steps]; returns how many; the actions' come last."""
+    n = 0
+    for factor in range(states.shape[1]):
+        value = states[b, factor]
+        if layout.outputs[factor] != 2:
+            out[n] = layout.start[factor] + value
+            n += 1
+        else:  # without a branch: bits cannot be foretold
+            out[n] = layout.start[factor]
+            n += value
+    for step in range(layout.n_steps):
+        out[n + step] = layout.n_state_columns + step * layout.n_actions + action % layout.n_actions
+        action //= layout.n_actions
+    return n + layout.n_steps
+
+
+@inlined
+def add_next(
+    states: Ints, b: int, i: int, value: int, layout: Layout, group: GroupWeights, columns: Ints, n: int, place: int
+) -> int:
+    """Adds what a group sees of factor i's next value to the list ``columns`` of ``active_columns``; returns its new length.
+
+    ``place`` is where the list has the state's column of the factor, if that is on. Written without branches: bits cannot be
+    foretold.
+    """
+    column, on = layout.start[i], 1
+    if layout.outputs[i] == 2:
+        on = value
+    else:
+        column += value
+    same = 0
+    if i < states.shape[1]:
+        same = on * int(states[b, i] == value)
+    columns[place] += same * group.both_start
+    columns[n] = group.next_start + column
+    return n + on - same
+
+
+@inlined
+def next_place(states: Ints, b: int, i: int, layout: Layout, place: int) -> int:
+    """Place among ``active_columns`` of the factor after i, if its column is on, from that of factor i."""
+    if i < states.shape[1]:
+        place += 1 if layout.outputs[i] != 2 else states[b, i]
+    return place
+
+
+@inlined
+def _add_residual(
+    states: Ints, b: int, active: Ints, n_active: int, layout: Layout, stay: Floats32, columns: Floats32, r: int
+) -> None:
+    """Adds what leads each state column to itself: its weight where it is 1, minus its weight where it is 0."""
+    n_on = n_active - layout.n_steps
+    for step in range(n_on, n_active):
+        row = active[step] - layout.n_state_columns
+        if layout.n_state_columns == states.shape[1]:  # all are bits
+            add_signed(states, b, stay, row, columns, r)
+            continue
+        for column in range(layout.n_state_columns):
+            columns[r, column] -= stay[row, column]
+        for a in range(n_on):
+            columns[r, active[a]] += np.float32(2.0) * stay[row, active[a]]
+
+
+@inlined
+def _dense_block(
+    first: int,
+    n_rows: int,
+    states: Ints,
+    actions: Ints,
+    layout: Layout,
+    dense: DenseWeights,
+    active: Ints,
+    now: Floats32,
+    after: Floats32,
+    columns: Floats32,
+) -> None:
+    """The output columns [R, C] of rows from ``first`` on; ``active``, ``now`` and ``after`` [R, H] are work space."""
+    depth = len(dense.sizes)
+    for r in range(n_rows):
+        b = first + r
+        n_active = active_columns(states, b, actions[b], layout, active)
+        for column in range(columns.shape[1]):
+            columns[r, column] = dense.column_bias[column]
+        _add_residual(states, b, active, n_active, layout, dense.stay, columns, r)
+        if depth == 0:
+            add_rows(dense.first, active, n_active, columns, r)
+            continue
+        copy_row(dense.bias, 0, now, r)
+        add_rows(dense.first, active, n_active, now, r)
+        activate(now, r, dense.sizes[0], dense.activation)
+    for level in range(1, depth):
+        for r in range(n_rows):
+            copy_row(dense.bias, level, after, r)
+        add_products(now, n_rows, dense.sizes[level - 1], dense.inner[level - 1], after)
+        for r in range(n_rows):
+            activate(after, r, dense.sizes[level], dense.activation)
+        now[:] = after
+    if depth:
+        add_products(now, n_rows, dense.sizes[depth - 1], dense.to_columns, columns)
+
+
+@compiled
+def dense_logits(states: Ints, actions: Ints, layout: Layout, dense: DenseWeights) -> Floats32:
+    """A dense predictor's logits, float32 [B, O, K]; values a factor lacks are at -1e9."""
+    n_outputs, width = len(layout.outputs), layout.outputs.max()
+    logits = np.full((len(states), n_outputs, width), np.float32(-1e9), dtype=np.float32)
+    rows = min(len(states), ROWS)
+    active = np.empty(states.shape[1] + layout.n_steps, dtype=np.int64)
+    now = np.empty((rows, dense.to_columns.shape[1]), dtype=np.float32)
+    after = np.empty_like(now)
+    columns = np.empty((rows, len(dense.column_bias)), dtype=np.float32)
+    for first in range(0, len(states), ROWS):
+        n_rows = min(ROWS, len(states) - first)
+        _dense_block(first, n_rows, states, actions, layout, dense, active, now, after, columns)
+        for r in range(n_rows):
+            if width == 2:
+                write_bits(columns, r, logits, first + r)
+                continue
+            for i in range(n_outputs):
+                start = layout.start[i]
+                if layout.outputs[i] == 2:
+                    logits[first + r, i, 0] = 0.0
+                    logits[first + r, i, 1] = columns[r, start]
+                else:
+                    for k in range(layout.outputs[i]):
+                        logits[first + r, i, k] = columns[r, start + k]
+    return logits
+
+
+@inlined
+def largest(probs: Floats, b: int, i: int, n: int) -> int:
+    """The likeliest of the ``n`` values of factor i in row b; the lowest of equals."""
+    best = 0
+    for k in range(1, n):
+        if probs[b, i, k] > probs[b, i, best]:
+            best = k
+    return best
+
+
+@inlined
+def trusted(probs: Floats, b: int, i: int, layout: Layout, group: GroupWeights, certain: float) -> bool:
+    """Whether factor i of row b is left to the predictor, which gives it the distributions ``probs`` [B, O, K]."""
+    if group.group_of[i] < 0:
+        return True
+    return bool(probs[b, i, largest(probs, b, i, layout.outputs[i])] >= certain)
+
+
+@inlined
+def finish(
+    b: int,
+    i: int,
+    logits: Floats32,
+    layout: Layout,
+    group: GroupWeights,
+    sums: Floats32,
+    row: int,
+    hidden: Floats32,
+    row_logits: Floats32,
+    out: Floats,
+) -> None:
+    """From the summed input ``sums[row]`` [G] of factor i's group to the factor's distribution ``out`` [K].
+
+    ``logits`` [B, O, K] are the predictor's; ``hidden`` [1, G] and ``row_logits`` [K] are work space.
+    """
+    n, g, code = layout.outputs[i], group.group_of[i], group.activation
+    if n > 2:  # each node once, for all values
+        for h in range(hidden.shape[1]):
+            hidden[0, h] = sums[row, h]
+        activate(hidden, 0, hidden.shape[1], code)
+        for k in range(n):
+            row_logits[k] = group.offset[g, k] + product(hidden, 0, LINEAR, group.to_values, g, k)
+    else:
+        row_logits[0] = 0.0
+        row_logits[1] = group.offset[g, 1] + product(sums, row, code, group.to_values, g, 1)
+    if group.correction:
+        for k in range(n):
+            row_logits[k] += logits[b, i, k]
+    softmax(row_logits, n, out)

@@ -1,0 +1,215 @@
+"""The two networks of a neural model: how they are built, kept as arrays, and which of their connections are left."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from mbagent.models.base import BaseTransitionModel
+from mbagent.models.neural import bit_kernels as bit_kernels  # registers its overloads
+from mbagent.models.neural.connections import Connections
+from mbagent.models.neural.export import pack_layout
+from mbagent.models.neural.networks import Activation, Conditioner, DensePredictor, FactorCodec, Mask
+from mbagent.models.neural.training import TrainingConfig
+from mbagent.models.protocol import LARGEST_NUMBER
+
+
+@dataclass(frozen=True)
+class NeuralConfig:
+    """What the networks look like and how they are used.
+
+    Attributes:
+        hidden: sizes of the dense predictor's hidden layers.
+        activation: of all hidden nodes.
+        residual: whether the predictor has a learned path from s_i to s'_i.
+        conditioner: "causal" (ancestral sampling, exact probabilities), "others" (the paper's sweeps), or None (factors
+            independent given state and action).
+        group_size: hidden nodes in each of the conditioner's groups.
+        correction: whether the conditioner's output is added to the predictor's logits.
+        certain: a factor whose likeliest value has this probability in the predictor's eyes is left to the predictor; in sweeps
+            the conditioner is asked about it only where the number drawn could matter (``sweep_blocks.LEEWAY``).
+        dropout: share of hidden nodes zeroed in each training step; without it, networks learn the noise of rare
+            states. None: 0.4, or 0 where the state is a single factor: its columns show nothing that states have in
+            common, the network is a table then, and dropout only blurs it.
+        sweeps: passes over all factors, mask "others".
+        real_guess: whether the first guess is the predictor's probabilities rather than bits drawn from them.
+        training: see TrainingConfig.
+    """
+
+    hidden: tuple[int, ...] = (128,)
+    activation: Activation = "silu"
+    residual: bool = True
+    conditioner: Mask | None = "causal"
+    group_size: int = 16
+    correction: bool = True
+    certain: float = 0.999
+    dropout: float | None = None
+    sweeps: int = 5
+    real_guess: bool = False
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+
+    def dropout_for(self, n_factors: int) -> float:
+        """The dropout share that is meant for states of ``n_factors`` factors."""
+        if self.dropout is not None:
+            return self.dropout
+        return 0.4 if n_factors > 1 else 0.0
+
+    @classmethod
+    def paper(cls, n_variables: int) -> NeuralConfig:
+        """Section 3's networks as they stand, for d = ``n_variables``: 2d + 1 and 2d^2 hidden nodes, sigmoids, squared error."""
+        return cls(
+            hidden=(2 * n_variables + 1,),
+            activation="sigmoid",
+            residual=False,
+            conditioner="others",
+            group_size=2 * n_variables,
+            correction=False,
+            certain=1.0,
+            dropout=0.0,
+            training=TrainingConfig(learning_rate=0.03, weight_decay=0.0, loss="squared"),
+        )
+
+
+BodyFactory: TypeAlias = Callable[[FactorCodec, torch.Generator], nn.Module]
+"""Builds a predictor body (see ``networks.Predictor``); all its first weights must come from the generator."""
+
+
+PRUNED = "pruned"
+"""An array of this name says that weights which are exactly 0 are connections that are gone; see ``tabulate.find_parents``."""
+
+
+NO_MARKS = np.zeros((0, 0), dtype=np.int8)
+"""Of a model that has no tables."""
+
+
+class NetworkPair(BaseTransitionModel):
+    """A predictor network, alone or with a conditioner network.
+
+    Args:
+        cardinalities: number of values of each state factor, length F.
+        n_actions: number of enumerated actions A of a single step.
+        config: see NeuralConfig.
+        body: builds another predictor body than the dense one.
+        n_steps: actions in the string that is an action of this model (paper 4.2); see ``FactorCodec``.
+        seed: of the first weights; ``fit`` starts from its own seed's.
+    """
+
+    def __init__(
+        self,
+        cardinalities: tuple[int, ...],
+        n_actions: int,
+        config: NeuralConfig | None = None,
+        *,
+        body: BodyFactory | None = None,
+        n_steps: int = 1,
+        seed: int = 0,
+    ) -> None:
+        if n_steps < 1 or n_actions**n_steps > LARGEST_NUMBER:
+            raise ValueError(
+                f"A model's action is a string of 1 or more actions, at most {LARGEST_NUMBER:.0e} strings in all; "
+                f"got n_steps = {n_steps} with {n_actions} actions."
+            )
+        super().__init__(cardinalities, n_actions**n_steps)
+        self.config = config or NeuralConfig()
+        self.codec = FactorCodec(self.cardinalities, n_actions, n_steps)
+        self._body = body
+        self._layout = pack_layout(self.codec)
+        self._dropout = self.config.dropout_for(len(self.cardinalities))
+        self._build(seed)
+
+    def _build(self, seed: int) -> torch.Generator:
+        """New networks; returns the generator that their weights came from."""
+        config, generator = self.config, torch.Generator().manual_seed(seed)
+        self.predictor: nn.Module
+        if self._body is not None:
+            self.predictor = self._body(self.codec, generator)
+        else:
+            shape = (config.hidden, config.activation, config.residual, self._dropout)
+            self.predictor = DensePredictor(self.codec, *shape, generator=generator)
+        self.conditioner: Conditioner | None = None
+        if config.conditioner is not None:
+            self.conditioner = self._new_conditioner(None, generator)
+        self._online: torch.optim.Optimizer | None = None
+        self._pruned, self._marks = False, NO_MARKS
+        self._changed()
+        return generator
+
+    def _new_conditioner(self, grouped: torch.Tensor | None, generator: torch.Generator) -> Conditioner:
+        config = self.config
+        assert config.conditioner is not None
+        return Conditioner(
+            self.codec,
+            config.conditioner,
+            config.group_size,
+            config.activation,
+            config.correction,
+            self._dropout,
+            grouped,
+            generator=generator,
+        )
+
+    def _changed(self) -> None:
+        """Called whenever weights have changed."""
+
+    def state_dict(self) -> dict[str, NDArray[Any]]:
+        """See TransitionModel."""
+        arrays: dict[str, NDArray[Any]] = {
+            f"{part}.{name}": tensor.detach().numpy().copy()
+            for part, module in self._parts().items()
+            for name, tensor in module.state_dict().items()
+        }
+        return {**arrays, PRUNED: self._marks} if self._pruned else arrays
+
+    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """See TransitionModel.
+
+        Raises:
+            ValueError: the arrays are not those of a model of this shape; nothing is changed then.
+        """
+        wrong = self._misfit(state)
+        if wrong:
+            raise ValueError(
+                f"These weights do not fit this model (first difference: {wrong[0]!r}); "
+                "build the model with the configuration that the weights were saved from."
+            )
+        if self.conditioner is not None:
+            grouped = torch.from_numpy(np.array(state["conditioner.grouped"], dtype=np.bool_))
+            self.conditioner = self._new_conditioner(grouped, torch.Generator())
+        for part, module in self._parts().items():
+            names = module.state_dict()
+            module.load_state_dict({n: torch.from_numpy(np.array(state[f"{part}.{n}"])) for n in names})
+        self._online, self._pruned = None, PRUNED in state
+        self._marks = np.array(state.get(PRUNED, NO_MARKS), dtype=np.int8)
+        self._changed()
+
+    def _misfit(self, state: Mapping[str, NDArray[Any]]) -> list[str]:
+        """Names of arrays that are missing, unknown, or of the wrong shape (the conditioner's first axis is free)."""
+        own = self.state_dict()
+        wrong = sorted((set(own) ^ set(state)) - {PRUNED})
+        for name in set(own) - {PRUNED} if not wrong else ():
+            shape, given = own[name].shape, np.shape(state[name])
+            free = name.startswith("conditioner.") and name != "conditioner.grouped"
+            if shape[free:] != given[free:] or len(shape) != len(given):
+                wrong.append(name)
+        return wrong
+
+    def _parts(self) -> dict[str, nn.Module]:
+        parts = {"predictor": self.predictor}
+        if self.conditioner is not None:
+            parts["conditioner"] = self.conditioner
+        return parts
+
+    @property
+    def parents(self) -> NDArray[np.int8]:
+        """What each outcome bit of a pruned model hangs on, see ``tabulate.find_parents``; of any other model empty."""
+        return self._marks
+
+    def connections(self) -> dict[str, Connections]:
+        """The weights of each network, and which of them are left."""
+        return {part: Connections(module, self._pruned) for part, module in self._parts().items()}

@@ -1,0 +1,203 @@
+"""The plane predictor (``planes.py``) compiled: torch trains, numba samples.
+
+Each row is computed by itself, so its result does not depend on the rows beside it. Shapes: C' input channels (planes,
+or planes times values), H rows, W columns, D hidden channels, A actions.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mbagent.models.neural.networks import PlanePredictor
+from mbagent.types import Ints
+from mbagent_envs.jit import compiled
+
+Floats32 = NDArray[np.float32]
+
+
+class PlaneWeights(NamedTuple):
+    """A PlanePredictor's weights, laid out for the kernel.
+
+    Attributes:
+        row, column, channel: int64 [F], where each factor lies (channel of its value 0 where cells have many values).
+        values: 1 for binary cells, else K.
+        first: [C', 3, 3, D]; base: [H, W, D], bias and border of the first layer; action: [A, D].
+        second: [9 * D, D] (in, out); second_bias: [D]; second_top: [D, D] (in, out).
+        out: [D, C'] ; out_bias: [C']; out_top: [D, C'].
+        end: [D]; end_bias: [1].
+        stay: [C'].
+    """
+
+    row: Ints
+    column: Ints
+    channel: Ints
+    values: int
+    first: Floats32
+    base: Floats32
+    action: Floats32
+    second: Floats32
+    second_bias: Floats32
+    second_top: Floats32
+    out: Floats32
+    out_bias: Floats32
+    out_top: Floats32
+    end: Floats32
+    end_bias: Floats32
+    stay: Floats32
+
+
+@torch.no_grad()
+def pack_planes(body: PlanePredictor) -> PlaneWeights:
+    """The weights of a torch predictor."""
+    layout, values = body.layout, body.values
+    shape = (layout.height, layout.width, layout.channels) if layout.channels_last else ()
+    shape = shape or (layout.channels, layout.height, layout.width)
+    index = np.indices(shape).reshape(3, -1)
+    row, column, channel = index if layout.channels_last else (index[1], index[2], index[0])
+    ones = torch.zeros(1, body.first.weight.shape[1], layout.height, layout.width)
+    ones[:, -1] = 1.0
+    base = body.first(ones)[0].permute(1, 2, 0)
+    first = body.first.weight[:, :-1].permute(1, 2, 3, 0)
+    return PlaneWeights(
+        np.ascontiguousarray(row),
+        np.ascontiguousarray(column),
+        np.ascontiguousarray(channel * values),
+        values,
+        _array(first),
+        _array(base),
+        _array(body.action),
+        _array(body.second.weight.permute(2, 3, 1, 0).reshape(-1, body.second.weight.shape[0])),
+        _array(body.second.bias + body.second_top.bias),
+        _array(body.second_top.weight.T),
+        _array(body.out.weight[:, :, 0, 0].T),
+        _array(body.out.bias + body.out_top.bias),
+        _array(body.out_top.weight.T),
+        _array(body.end.weight[0]),
+        _array(body.end.bias),
+        _array(body.stay.repeat_interleave(values)),
+    )
+
+
+def _array(tensor: torch.Tensor) -> Floats32:
+    return np.ascontiguousarray(tensor.detach().numpy(), dtype=np.float32)
+
+
+@compiled
+def plane_logits(states: Ints, actions: Ints, w: PlaneWeights, width: int) -> Floats32:
+    """Logits float32 [B, O, K] for states int64 [B, F] and actions int64 [B]; K is ``width``, ``terminated`` comes last."""
+    n_rows, n_factors = states.shape
+    height, columns, hidden = w.base.shape
+    cells = height * columns
+    logits = np.zeros((n_rows, n_factors + 1, width), dtype=np.float32)
+    plain = np.empty((height, columns, hidden), dtype=np.float32)
+    padded = np.zeros((height + 2) * (columns + 2) * hidden, dtype=np.float32)
+    patches = np.zeros((cells, 9 * hidden), dtype=np.float32)
+    above, read = np.empty((cells, hidden), dtype=np.float32), np.empty((cells, len(w.out_bias)), dtype=np.float32)
+    top, bias = np.empty(hidden, dtype=np.float32), np.empty(hidden, dtype=np.float32)
+    out_bias = np.empty(len(w.out_bias), dtype=np.float32)
+    for b in range(n_rows):
+        if b == 0 or not _same(states, b):
+            _first_layer(states[b], w, plain)
+        _activate_first(plain, w.action[actions[b]], padded, patches, top)
+        # One product for each state: in a product for several, some processors round a row by its place among them.
+        np.dot(patches, w.second, above)
+        _mix(top, w.second_top, w.second_bias, bias)
+        _activate_second(above, bias, top)
+        np.dot(above, w.out, read)
+        _mix(top, w.out_top, w.out_bias, out_bias)
+        _read_out(states[b], w, read, out_bias, columns, logits[b])
+        total = w.end_bias[0]
+        for d in range(hidden):
+            total += top[d] * w.end[d]
+        logits[b, n_factors, 1] = total
+    return logits
+
+
+@compiled
+def _same(states: Ints, b: int) -> bool:
+    """Whether row b is the state of the row before it: its first layer is then known but for the action."""
+    return bool((states[b] == states[b - 1]).all())
+
+
+@compiled
+def _first_layer(state: Ints, w: PlaneWeights, plain: Floats32) -> None:
+    """First convolution without the action: only cells that are on are worth a multiplication."""
+    height, columns, hidden = plain.shape
+    plain[:] = w.base
+    for f in range(len(state)):
+        if w.values == 1 and state[f] == 0:
+            continue
+        channel = w.channel[f] if w.values == 1 else w.channel[f] + state[f]
+        for dy in range(3):
+            y = w.row[f] + 1 - dy
+            if y < 0 or y >= height:
+                continue
+            for dx in range(3):
+                x = w.column[f] + 1 - dx
+                if x < 0 or x >= columns:
+                    continue
+                for d in range(hidden):
+                    plain[y, x, d] += w.first[channel, dy, dx, d]
+
+
+@compiled
+def _activate_first(plain: Floats32, action: Floats32, padded: Floats32, patches: Floats32, top: Floats32) -> None:
+    """Switches the action on, and writes each position's 3x3 neighbourhood to a row of ``patches`` [H * W, 9 * D].
+
+    ``padded`` [(H + 2) * (W + 2) * D] holds the activations with a border of zeros: three neighbours in a row lie side
+    by side there, so a patch is three runs of 3 * D numbers.
+    """
+    height, columns, hidden = plain.shape
+    top[:] = 0.0
+    for y in range(height):
+        for x in range(columns):
+            cell = padded[((y + 1) * (columns + 2) + x + 1) * hidden :][:hidden]
+            source = plain[y, x]
+            for d in range(hidden):
+                value = max(source[d] + action[d], np.float32(0.0))
+                cell[d] = value
+                top[d] = max(top[d], value)
+    run = 3 * hidden
+    for y in range(height):
+        for x in range(columns):
+            row = patches[y * columns + x]
+            for dy in range(3):
+                start = ((y + dy) * (columns + 2) + x) * hidden
+                row[dy * run : (dy + 1) * run] = padded[start : start + run]
+
+
+@compiled
+def _mix(top: Floats32, weights: Floats32, start: Floats32, result: Floats32) -> None:
+    """``result = start + top @ weights``."""
+    result[:] = start
+    for d in range(len(top)):
+        value = top[d]
+        if value != 0.0:
+            for e in range(len(result)):
+                result[e] += value * weights[d, e]
+
+
+@compiled
+def _activate_second(above: Floats32, bias: Floats32, top: Floats32) -> None:
+    flat, hidden = above.reshape(-1), above.shape[1]
+    top[:] = 0.0
+    for start in range(0, len(flat), hidden):
+        for d in range(hidden):
+            value = max(flat[start + d] + bias[d], np.float32(0.0))
+            flat[start + d] = value
+            top[d] = max(top[d], value)
+
+
+@compiled
+def _read_out(state: Ints, w: PlaneWeights, read: Floats32, out_bias: Floats32, columns: int, logits: Floats32) -> None:
+    for f in range(len(state)):
+        position, first = w.row[f] * columns + w.column[f], w.channel[f]
+        for k in range(w.values):
+            channel = first + k
+            on = state[f] == (1 if w.values == 1 else k)
+            stay = w.stay[channel] if on else -w.stay[channel]
+            logits[f, 1 if w.values == 1 else k] = read[position, channel] + out_bias[channel] + stay

@@ -1,0 +1,395 @@
+"""Sampling from predictor and conditioner (paper 3.1 and 3.2), compiled; every row draws from its own key.
+
+Three samplers: each factor independently (no conditioner), ancestral (conditioner masked to y_<i; exact), and the paper's sweeps
+(conditioner masked to all but y_i; in ``gibbs.py``). For planning, successors are listed where they are few; else they are
+systematic draws. Main particles hold the grid points (j + offset) / n of [0, 1). At each factor a particle's interval is split in
+proportion to P(y_i | s, a, y_<i) and its points go to the parts; parts without a point are dropped. So work grows with the number
+of different outcomes and not with n. The offset is the same for all rows: two actions, or two states, differ by their effects and
+not by chance. A particle with a single point continues with fresh numbers, hashed from (seed, point, factor), since its interval
+would soon be too narrow for a float.
+Shapes: B batch, F state factors, O = F + 1 output factors, K largest cardinality, n points a row, M successors. Rows of arrays
+are addressed by index, not sliced: a slice costs more than the work done with it here.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from mbagent.models.neural.kernels import (
+    Floats32,
+    GroupWeights,
+    Layout,
+    active_columns,
+    add_columns,
+    add_next,
+    copy_row,
+    finish,
+    largest,
+    next_place,
+    trusted,
+)
+from mbagent.models.protocol import Successors
+from mbagent.models.systematic_sampling import (
+    MAIN,
+    NEGLIGIBLE,
+    STRATA,
+    Found,
+    Grid,
+    assemble,
+    begin,
+    draw,
+    new_particles,
+    place_of,
+    prune,
+    room,
+    rows_at_once,
+    settle,
+    share_out,
+    start,
+    used,
+    write,
+)
+from mbagent.types import Floats, Ints, Keys
+from mbagent_envs.jit import borrowed, compiled, inlined
+from mbagent_envs.random_keys import fill_row, uniform_at
+
+
+class Work(NamedTuple):
+    """Work space for one row.
+
+    Attributes:
+        columns: those that are on, int64 [2 * O + n_steps].
+        luck: a number for each factor, [O].
+        sums: input of one group, [1, G].
+        row_logits: of one factor, [K].
+        given: its distribution, [K].
+    """
+
+    columns: Ints
+    luck: Floats
+    sums: Floats32
+    row_logits: Floats32
+    given: Floats
+
+
+@compiled
+def work_space(layout: Layout, group: GroupWeights) -> Work:
+    """Room for one row of a model of this shape."""
+    n_outputs, size, n_values = len(layout.outputs), group.bias.shape[1], group.offset.shape[1]
+    return Work(
+        np.empty(2 * n_outputs + layout.n_steps, dtype=np.int64),
+        np.empty(n_outputs, dtype=np.float64),
+        np.empty((1, size), dtype=np.float32),
+        np.empty(n_values, dtype=np.float32),
+        np.empty(n_values, dtype=np.float64),
+    )
+
+
+@inlined
+def draw_at(probs: Floats, b: int, i: int, n: int, u: float) -> int:
+    """As ``draw``, from ``probs[b, i]``."""
+    chosen = 0
+    for k in range(n):
+        if probs[b, i, k] > 0.0:
+            chosen = k
+            u -= probs[b, i, k]
+            if u < 0.0:
+                break
+    return chosen
+
+
+@inlined
+def _likeliest(values: Floats, n: int) -> int:
+    """Index of the largest of the first ``n`` values; the lowest of equals."""
+    best = 0
+    for k in range(1, n):
+        if values[k] > values[best]:
+            best = k
+    return best
+
+
+@compiled
+def sample_independent(probs: Floats, outputs: Ints, keys: Keys) -> Ints:
+    """Draws int64 [B, O]: factor i of row b at number i of key b."""
+    factors = np.empty(probs.shape[:2], dtype=np.int64)
+    for b in range(probs.shape[0]):
+        for i in range(probs.shape[1]):
+            u = uniform_at(keys[b], i)
+            if outputs[i] == 2:  # written out: bits are the common case
+                factors[b, i] = 1 if u >= probs[b, i, 0] and probs[b, i, 1] > 0.0 else 0
+            else:
+                factors[b, i] = draw_at(probs, b, i, outputs[i], u)
+    return factors
+
+
+@compiled
+def sample_causal(
+    states: Ints,
+    actions: Ints,
+    logits: Floats32,
+    probs: Floats,
+    keys: Keys,
+    layout: Layout,
+    group: GroupWeights,
+    certain: float,
+    greedy: bool,
+) -> Ints:
+    """Ancestral draws int64 [B, O]: y_0, then y_1 given it, and so on; ``greedy`` takes the likeliest each time instead.
+
+    A factor whose likeliest value has at least ``certain`` in the predictor's eyes, or that has no group in the
+    conditioner, is drawn from the predictor. This is part of the model: ``log_prob_causal`` follows the same rule, so
+    both stay exact.
+
+    Args:
+        states: int64 [B, F].
+        actions: int64 [B].
+        logits: the predictor's, float32 [B, O, K].
+        probs: the predictor's, float64 [B, O, K].
+        keys: uint64 [B].
+        layout: the factors.
+        group: the conditioner, masked "causal".
+        certain: as said above.
+        greedy: as said above.
+    """
+    factors = np.empty((len(states), len(layout.outputs)), dtype=np.int64)
+    work = work_space(layout, group)
+    for b in range(len(states)):
+        _causal_row(b, states, actions[b], logits, probs, keys[b], layout, group, certain, greedy, work, factors)
+    return factors
+
+
+@compiled
+def _causal_row(
+    b: int,
+    states: Ints,
+    action: int,
+    logits: Floats32,
+    probs: Floats,
+    key: np.uint64,
+    layout: Layout,
+    group: GroupWeights,
+    certain: float,
+    greedy: bool,
+    work: Work,
+    factors: Ints,
+) -> None:
+    """Row b of ``sample_causal``, to ``factors`` [B, O]."""
+    # The caller keeps all of this alive: no references need be counted for every factor.
+    states, logits, probs, factors = borrowed(states), borrowed(logits), borrowed(probs), borrowed(factors)
+    layout, group, w = borrowed(layout), borrowed(group), borrowed(work)
+    fill_row(key, w.luck)
+    n_columns, place = active_columns(states, b, action, layout, w.columns), 0
+    for i in range(len(layout.outputs)):
+        n, u = layout.outputs[i], w.luck[i]
+        if trusted(probs, b, i, layout, group, certain):
+            if n == 2:  # written out, as in sample_independent
+                value = int((0.5 if greedy else u) >= probs[b, i, 0] and probs[b, i, 1] > 0.0)
+            else:
+                value = largest(probs, b, i, n) if greedy else draw_at(probs, b, i, n, u)
+        else:
+            _condition(b, i, logits, layout, group, n_columns, w)
+            value = _likeliest(w.given, n) if greedy else draw(w.given, n, u)
+        factors[b, i] = value
+        n_columns = add_next(states, b, i, value, layout, group, w.columns, n_columns, place)
+        place = next_place(states, b, i, layout, place)
+
+
+@inlined
+def _condition(b: int, i: int, logits: Floats32, layout: Layout, group: GroupWeights, n_columns: int, w: Work) -> None:
+    """Writes factor i's distribution, given the columns that are on, to ``w.given``."""
+    g = group.group_of[i]
+    copy_row(group.bias, g, w.sums, 0)
+    add_columns(group.columns, g, w.columns, n_columns, w.sums, 0)
+    finish(b, i, logits, layout, group, w.sums, 0, w.sums, w.row_logits, w.given)
+
+
+@compiled
+def log_prob_causal(
+    states: Ints,
+    actions: Ints,
+    factors: Ints,
+    logits: Floats32,
+    probs: Floats,
+    layout: Layout,
+    group: GroupWeights,
+    certain: float,
+) -> Floats:
+    """Log-probability [B] of the outcomes ``factors`` [B, O] under exactly what ``sample_causal`` draws."""
+    result, work = np.zeros(len(states), dtype=np.float64), work_space(layout, group)
+    for b in range(len(states)):
+        n_columns, place = active_columns(states, b, actions[b], layout, work.columns), 0
+        for i in range(len(layout.outputs)):
+            value = factors[b, i]
+            probability = probs[b, i, value]
+            if not trusted(probs, b, i, layout, group, certain):
+                _condition(b, i, logits, layout, group, n_columns, work)
+                probability = work.given[value]
+            result[b] += math.log(probability) if probability > 0.0 else -np.inf
+            n_columns = add_next(states, b, i, value, layout, group, work.columns, n_columns, place)
+            place = next_place(states, b, i, layout, place)
+    return result
+
+
+@compiled
+def _independent(probs: Floats, outputs: Ints, grid: Grid) -> Found:
+    n_rows, n_outputs, n_grid = probs.shape[0], probs.shape[1], grid[0]
+    p, found = new_particles(n_grid, n_outputs, probs.shape[2]), room(n_rows, n_grid, n_outputs)
+    base, still_open = np.empty(n_outputs, dtype=np.int64), np.empty(n_outputs, dtype=np.int64)
+    values = np.empty(probs.shape[2], dtype=np.float64)
+    total = 0
+    for b in range(n_rows):
+        n_open = 0
+        settle(probs, b, outputs, base)
+        begin(p, n_grid, _fits(probs, b, outputs, base, n_grid), 0)  # no state is known
+        for i in range(n_outputs):
+            if base[i] >= 0:
+                continue
+            for k in range(outputs[i]):
+                values[k] = probs[b, i, k]
+            prune(values, outputs[i])
+            still_open[n_open] = i
+            share_out(p, -1, i, n_open, values, outputs[i], i == n_outputs - 1, grid)
+            n_open += 1
+        found[0][b] = write(p, base, still_open, n_open, n_grid, total, found)
+        total += found[0][b]
+    return used(found, total)
+
+
+@compiled
+def _fits(probs: Floats, b: int, outputs: Ints, base: Ints, n_grid: int) -> bool:
+    """Whether all outcomes of row b can be listed, by its factors that are still open in ``base`` [O]."""
+    n = 1
+    for i in range(len(outputs)):
+        if base[i] < 0:
+            top, possible = probs[b, i].max(), 0
+            for k in range(outputs[i]):
+                possible += int(probs[b, i, k] >= NEGLIGIBLE * top)
+            n *= possible
+            if n > n_grid:
+                return False
+    return True
+
+
+@compiled
+def _causal(
+    states: Ints,
+    actions: Ints,
+    logits: Floats32,
+    probs: Floats,
+    layout: Layout,
+    group: GroupWeights,
+    certain: float,
+    grid: Grid,
+) -> Found:
+    n_outputs, n_grid = probs.shape[1], grid[0]
+    p, found = new_particles(n_grid, n_outputs, probs.shape[2]), room(len(states), n_grid, n_outputs)
+    base, still_open, columns = np.empty((3, n_outputs), dtype=np.int64)
+    active = np.empty(n_outputs + layout.n_steps, dtype=np.int64)
+    sums = np.empty((2, group.bias.shape[1]), dtype=np.float32)  # of what all particles share; of one particle
+    row_logits, hidden = np.empty(probs.shape[2], dtype=np.float32), np.empty((1, group.bias.shape[1]), dtype=np.float32)
+    values, total = np.empty(probs.shape[2], dtype=np.float64), 0
+    for b in range(len(states)):
+        n_active = active_columns(states, b, actions[b], layout, active)
+        n_open, possible = 0, 1
+        settle(probs, b, layout.outputs, base)
+        for i in range(n_outputs):
+            if not (group.group_of[i] < 0 or trusted(probs, b, i, layout, group, certain)):
+                base[i] = -1
+            possible = min(possible * (layout.outputs[i] if base[i] < 0 else 1), n_grid + 1)
+        begin(p, n_grid, possible <= n_grid, place_of(states[b]))
+        for i in range(n_outputs):
+            n, trust = layout.outputs[i], group.group_of[i] < 0 or trusted(probs, b, i, layout, group, certain)
+            if base[i] >= 0:
+                continue
+            still_open[n_open] = i
+            if trust:
+                values[:] = probs[b, i]
+                prune(values, n)
+                share_out(p, -1, i, n_open, values, n, i == n_outputs - 1, grid)
+            else:
+                _known_input(i, base, active, n_active, layout, group, columns, sums)
+            n_main, n_strata = p.state[MAIN], p.state[STRATA]
+            for j in range(0 if trust else n_main + n_strata):
+                slot = n_grid + j if j < n_strata else j - n_strata  # strata first
+                copy_row(sums, 0, sums, 1)
+                n_columns = _open_columns(p.factors, slot, still_open, n_open, layout, group, columns)
+                add_columns(group.columns, group.group_of[i], columns, n_columns, sums, 1)
+                finish(b, i, logits, layout, group, sums, 1, hidden, row_logits, values)
+                prune(values, n)
+                share_out(p, slot, i, n_open, values, n, i == n_outputs - 1, grid)
+            n_open += 1
+        found[0][b] = write(p, base, still_open, n_open, n_grid, total, found)
+        total += found[0][b]
+    return used(found, total)
+
+
+@compiled
+def _known_input(
+    i: int, base: Ints, active: Ints, n_active: int, layout: Layout, group: GroupWeights, columns: Ints, sums: Floats32
+) -> None:
+    """Writes to ``sums[0]`` what factor i's group gets in all particles of a row: from (s, a), and earlier factors they share."""
+    g, n = group.group_of[i], 0
+    for j in range(i):
+        if base[j] >= 0 and (layout.outputs[j] != 2 or base[j] == 1):
+            columns[n] = group.next_start + layout.start[j] + (0 if layout.outputs[j] == 2 else base[j])
+            n += 1
+    copy_row(group.bias, g, sums, 0)
+    add_columns(group.columns, g, active, n_active, sums, 0)
+    add_columns(group.columns, g, columns, n, sums, 0)
+
+
+@compiled
+def _open_columns(
+    factors: Ints, q: int, still_open: Ints, n_open: int, layout: Layout, group: GroupWeights, columns: Ints
+) -> int:
+    """Writes the columns that are 1 by the open factors of particle ``q``; returns how many."""
+    n = 0
+    for w in range(n_open):
+        j, value = still_open[w], factors[q, w]
+        if layout.outputs[j] != 2 or value == 1:
+            columns[n] = group.next_start + layout.start[j] + (0 if layout.outputs[j] == 2 else value)
+            n += 1
+    return n
+
+
+def independent_successors(probs: Floats, outputs: Ints, n_samples: int, seed: int) -> Successors:
+    """Successors under independent factors.
+
+    Args:
+        probs: float64 [B, O, K], each factor's distribution.
+        outputs: int64 [O], cardinalities; the last factor is ``terminated``.
+        n_samples: grid points n a row.
+        seed: which grid offset and fresh numbers.
+    """
+    key, offset = start(seed)
+    step = rows_at_once(n_samples, len(outputs))
+    grid = (n_samples, key, offset)
+    parts = [_independent(probs[b : b + step], outputs, grid) for b in range(0, len(probs), step)]
+    return assemble(parts, len(outputs))
+
+
+def causal_successors(
+    states: Ints,
+    actions: Ints,
+    logits: Floats32,
+    probs: Floats,
+    layout: Layout,
+    group: GroupWeights,
+    certain: float,
+    n_samples: int,
+    seed: int,
+) -> Successors:
+    """Successors under a compiled causal conditioner.
+
+    Arguments are those of ``samplers.sample_causal``, and ``n_samples`` and ``seed`` as above.
+    """
+    key, offset = start(seed)
+    step = rows_at_once(n_samples, len(layout.outputs))
+    parts = []
+    for b in range(0, len(states), step):
+        given = (states[b : b + step], actions[b : b + step], logits[b : b + step], probs[b : b + step])
+        parts.append(_causal(*given, layout, group, certain, (n_samples, key, offset)))
+    return assemble(parts, len(layout.outputs))

@@ -1,0 +1,418 @@
+"""Truth tables of pruned networks of bits.
+
+Each outcome bit has a table over the few bits that it still depends on, of the state and of earlier outcome bits; a draw is one
+look-up. The parents of a bit are the inputs connected to it by some path whose effect exceeds a tolerance; constant inputs and
+negligible paths are fixed to the input's mode, and the resulting error is measured on transitions. A bit with too many parents
+for a table is drawn by the remaining connections of its networks (``sparse.py``).
+Shapes: F bits of a state, O = F + 1 of an outcome (``terminated`` last), A actions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mbagent.models.neural.bit_kernels import settled_chance, write_outcomes
+from mbagent.models.neural.networks import ACTIVATIONS, Affine, Conditioner, DensePredictor
+from mbagent.models.neural.sparse import Room, SparseNetworks, ask, leans_on_open, room_for, see_action, see_state
+from mbagent.models.neural.training import Examples
+from mbagent.models.overloads import Outcomes, implements, outcomes, work_for
+from mbagent.models.systematic_sampling import MAIN, STRATA, Particles, begin, bit_chances, new_particles, place_of, share_out
+from mbagent.types import Floats, Ints, Keys
+from mbagent_envs.jit import borrowed, compiled, inlined
+from mbagent_envs.random_keys import uniform_at
+
+MOST_PARENTS = 12
+"""A table has at most two to this power of entries for each action."""
+
+CONSTANT_TOLERANCE = 0.002
+"""What taking bits for their usual values may change in all, in total variation summed over variables."""
+
+PARENT = 2
+"""Marks a bit that matters; 0 and 1 are values that a bit is taken for."""
+
+ROWS = 8192
+"""Transitions that differences are measured on, at most."""
+
+Marks = NDArray[np.int8]
+
+
+class Pair(NamedTuple):
+    """The two networks and from which probability on the predictor is trusted."""
+
+    predictor: DensePredictor
+    conditioner: Conditioner | None
+    certain: float
+
+
+def _predicted(pair: Pair, inputs: Tensor, outputs: slice) -> Tensor:
+    """The predictor's logits of some outcome bits, from columns [N, n_inputs]."""
+    predictor, values = pair.predictor, inputs
+    for layer in predictor.layers:
+        values = ACTIVATIONS[predictor.activation](layer(values))
+    logits = values @ predictor.out.weight[outputs].T + predictor.out.bias[outputs]
+    if predictor.stay is not None:
+        n = predictor.codec.n_state_columns
+        signed = (2.0 * inputs[:, :n] - 1.0) * (inputs[:, n:] @ predictor.stay)
+        logits = logits + torch.cat((signed, signed.new_zeros(len(signed), 1)), dim=1)[:, outputs]
+    return logits
+
+
+def chances(pair: Pair, columns: Tensor, i: int) -> Tensor:
+    """P(bit i = 1) [N] from columns of state, action and outcome [N, n_inputs + O], as ``samplers.sample_causal`` has it."""
+    n_inputs, conditioner = pair.predictor.codec.n_inputs, pair.conditioner
+    logit = _predicted(pair, columns[:, :n_inputs], slice(i, i + 1))[:, 0]
+    chance = torch.sigmoid(logit.double())
+    if conditioner is None or not bool(conditioner.grouped[i]):
+        return chance
+    g, size = int(conditioner.grouped[:i].sum()), conditioner.group_size
+    groups, rows = conditioner.groups, slice(g * size, (g + 1) * size)
+    weight = groups.weight[rows] if groups.mask is None else groups.weight[rows] * groups.mask[rows]
+    hidden = ACTIVATIONS[conditioner.activation](columns @ weight.T + groups.bias[rows])
+    own = (hidden @ conditioner.readout[g] + conditioner.offset[g])[:, 0]
+    asked = torch.sigmoid((own + logit if conditioner.correction else own).double())
+    return torch.where(torch.maximum(chance, 1.0 - chance) >= pair.certain, chance, asked)
+
+
+def _paths(layers: list[Tensor]) -> NDArray[np.bool_]:
+    """Which inputs [outputs, inputs] a path leads from, through weights [to, from]."""
+    reach = (layers[0] != 0.0).double()
+    for weight in layers[1:]:
+        reach = ((weight != 0.0).double() @ reach > 0.0).double()
+    found: NDArray[np.bool_] = reach.numpy() > 0.0
+    return found
+
+
+def paths(pair: Pair) -> NDArray[np.bool_]:
+    """Which columns of state, action and outcome a path leads from to each outcome bit, bool [O, n_inputs + O]."""
+    predictor, conditioner, codec = pair.predictor, pair.conditioner, pair.predictor.codec
+    n_outputs, n_inputs = len(codec.outputs), codec.n_inputs
+    reach = np.zeros((n_outputs, n_inputs + n_outputs), dtype=np.bool_)
+    layers = [layer.weight.detach() for layer in (*predictor.layers, predictor.out) if isinstance(layer, Affine)]
+    reach[:, :n_inputs] = _paths(layers)
+    if predictor.stay is not None:
+        left = predictor.stay.detach().numpy() != 0.0
+        bits = np.arange(codec.n_state_columns)
+        reach[bits, bits] |= left.any(axis=0)
+        reach[bits, codec.n_state_columns : n_inputs] |= left.T
+    if conditioner is not None and len(conditioner.members):
+        weight = conditioner.groups.weight.detach()
+        weight = weight if conditioner.groups.mask is None else weight * conditioner.groups.mask
+        read = (conditioner.readout.detach() != 0.0).any(dim=2).double()
+        grouped = (weight != 0.0).double().view(len(read), conditioner.group_size, -1)
+        reach[conditioner.members.numpy()] |= torch.einsum("gh,ghc->gc", read, grouped).numpy() > 0.0
+    return reach
+
+
+@torch.no_grad()
+def find_parents(pair: Pair, rows: Examples) -> Marks:
+    """What each outcome bit hangs on: int8 [O, F + O], PARENT or the value that a bit is taken for; of state and outcome."""
+    codec, rows = pair.predictor.codec, rows.spread(ROWS)
+    columns = torch.cat((codec.inputs(rows.states, rows.actions), codec.targets(rows.outcomes)), dim=1)
+    usual, reach, n_bits = (columns.mean(dim=0) > 0.5).float(), paths(pair), codec.n_state_columns
+    bits = np.concatenate([np.arange(n_bits), np.arange(codec.n_inputs, columns.shape[1])])
+    marks = np.tile(usual.numpy().astype(np.int8)[bits], (len(reach), 1))
+    sample = Sample(columns, usual, rows.weights.double() / rows.weights.sum())
+    for i in range(len(reach)):
+        places = np.flatnonzero(reach[i, bits])
+        marks[i, places[sample.needed(pair, i, bits[places], CONSTANT_TOLERANCE / len(reach))]] = PARENT
+    return marks
+
+
+class Sample(NamedTuple):
+    """Transitions that differences are measured on.
+
+    Attributes:
+        columns: of state, action and outcome, [N, n_inputs + O].
+        usual: the value that each of them has most often.
+        weights: of the transitions, double [N], sum 1.
+    """
+
+    columns: Tensor
+    usual: Tensor
+    weights: Tensor
+
+    def needed(self, pair: Pair, i: int, columns: NDArray[np.int64], tolerance: float) -> NDArray[np.int64]:
+        """Places of the columns that outcome bit i hangs on: to take all others for their usual values changes less than this."""
+        known = chances(pair, self.columns, i)
+        alone = np.array([self._changed(pair, i, known, columns[place : place + 1]) for place in range(len(columns))])
+        order, few, many = np.argsort(alone, kind="stable"), 0, int((alone <= tolerance).sum())
+        while few < many:  # how many go together, at most
+            middle = (few + many + 1) // 2
+            if self._changed(pair, i, known, columns[order[:middle]]) <= tolerance:
+                few = middle
+            else:
+                many = middle - 1
+        return order[few:]
+
+    def _changed(self, pair: Pair, i: int, known: Tensor, columns: NDArray[np.int64]) -> float:
+        """How far the chance of bit i moves if these columns are taken for their usual values, mean over transitions."""
+        differs = torch.nonzero((self.columns[:, columns] != self.usual[columns]).any(dim=1))[:, 0]
+        if not len(differs):
+            return 0.0
+        changed = self.columns[differs]
+        changed[:, columns] = self.usual[columns]
+        return float(torch.dot((chances(pair, changed, i) - known[differs]).abs(), self.weights[differs]))
+
+
+def tabulable(marks: Marks) -> NDArray[np.bool_]:
+    """Which outcome bits have few enough parents for a table, bool [O]."""
+    few: NDArray[np.bool_] = (marks == PARENT).sum(axis=1) <= MOST_PARENTS
+    return few
+
+
+@torch.no_grad()
+def tabulate(pair: Pair, marks: Marks, which: NDArray[np.bool_]) -> list[Table | None]:
+    """Tables over what ``marks`` names, of the bits ``which``; None for all others."""
+    codec, reach = pair.predictor.codec, paths(pair)
+    acts = [bool(row[codec.n_state_columns : codec.n_inputs].any()) for row in reach]
+    return [_table(pair, marks[i], acts[i], i) if which[i] else None for i in range(len(marks))]
+
+
+def _table(pair: Pair, marks: Marks, acts: bool, i: int) -> Table:
+    """P(bit i = 1) for each value of its parents, and for each action where it ``acts``."""
+    codec, mine = pair.predictor.codec, np.flatnonzero(marks == PARENT)
+    n_bits, n_actions, size = codec.n_state_columns, codec.n_actions, 1 << len(mine)
+    fixed = torch.from_numpy(np.where(marks == PARENT, 0, marks).astype(np.float32))
+    columns = torch.zeros(size * n_actions if acts else size, codec.n_inputs + len(codec.outputs))
+    columns[:, :n_bits], columns[:, codec.n_inputs :] = fixed[:n_bits], fixed[n_bits:]
+    number = torch.arange(len(columns))
+    for power, j in enumerate(mine):
+        columns[:, j if j < n_bits else j + n_actions] = (number % size >> power & 1).float()
+    columns[number, n_bits + number // size] = 1.0
+    table: NDArray[np.float64] = chances(pair, columns, i).numpy().reshape(-1, *(2,) * len(mine))
+    return Table(tuple(mine[mine < n_bits].tolist()), tuple((mine[mine >= n_bits] - n_bits).tolist()), table)
+
+
+IMPROBABLE_TOLERANCE = 0.002
+"""What taking improbable values for impossible may change in all, in total variation summed over variables."""
+
+
+class Table(NamedTuple):
+    """What one outcome bit hangs on.
+
+    Attributes:
+        states: bits of the state, in order.
+        others: bits of the outcome, in order.
+        chances: P(bit = 1): [1 or A, 2, ..., 2], an axis for the action, and one for each of these bits, the last one first.
+    """
+
+    states: tuple[int, ...]
+    others: tuple[int, ...]
+    chances: Floats
+
+    def simplified(self, chances: Floats) -> Table:
+        """With other chances, and without what makes no difference to them."""
+        if len(chances) > 1 and (chances == chances[:1]).all():
+            chances = chances[:1]
+        bits, n_states = [*self.states, *self.others], len(self.states)
+        for v in range(len(bits) - 1, -1, -1):
+            axis = chances.ndim - 1 - v
+            if np.array_equal(chances.take(0, axis), chances.take(1, axis)):
+                chances = chances[(slice(None),) * axis + (0,)]
+                del bits[v]
+                n_states -= v < n_states
+        return Table(tuple(bits[:n_states]), tuple(bits[n_states:]), chances)
+
+
+class BitRules(NamedTuple):
+    """Tables and networks.
+
+    Attributes:
+        table: chances of all tables, one after another.
+        bits: a row for each outcome bit that is more than a copy, in order, int64 [R, 6]: the bit; where its table begins, -1 if
+            the networks are asked; how much further that of the next action is; where its parents begin, of the state, of the
+            outcome, and where they end.
+        parents: of all tables, int64.
+        copies: a row for each other bit, int64 [O - R, 4]: the bit; a bit of the state; what follows from its being 0; and 1.
+        n_actions: A.
+        networks: of the bits without a table; None where all have one.
+    """
+
+    table: Floats
+    bits: Ints
+    parents: Ints
+    copies: Ints
+    n_actions: int
+    networks: SparseNetworks | None
+
+
+def compile_rules(
+    tables: Sequence[Table | None], networks: SparseNetworks | None, n_actions: int, settled: bool = False
+) -> BitRules:
+    """The rules from a table, or None, for each outcome bit.
+
+    Args:
+        tables: chances that are next to 0 or 1 are taken for that.
+        networks: tell the bits that have no table.
+        n_actions: A.
+        settled: whether to leave out values as search does, see ``settled_chance``.
+    """
+    least, chances, bits, copies, size = IMPROBABLE_TOLERANCE / len(tables), [np.zeros(0)], [], [], 0
+    parents: list[int] = []
+    for i, table in enumerate(tables):
+        if table is None:
+            bits.append((i, -1, 0, len(parents), len(parents), len(parents)))
+            continue
+        sure = np.where(table.chances < least, 0.0, np.where(table.chances > 1.0 - least, 1.0, table.chances))
+        one = table.simplified(np.vectorize(settled_chance, otypes=[np.float64])(sure) if settled else sure)
+        flat = one.chances.reshape(len(one.chances), -1)
+        if len(one.states) <= 1 and not one.others and len(flat) == 1 and np.isin(flat, (0.0, 1.0)).all():
+            copies.append((i, *(one.states or (0,)), int(flat[0, 0]), int(flat[0, -1])))
+            continue
+        begin, middle = len(parents), len(parents) + len(one.states)
+        parents += [*one.states, *one.others]
+        bits.append((i, size, flat.shape[1] if len(flat) > 1 else 0, begin, middle, len(parents)))
+        chances.append(flat.ravel())
+        size += flat.size
+    rows, fixed = np.array(bits, dtype=np.int64).reshape(-1, 6), np.array(copies, dtype=np.int64).reshape(-1, 4)
+    return BitRules(np.concatenate(chances), rows, np.array(parents, dtype=np.int64), fixed, n_actions, networks)
+
+
+@inlined
+def _copy(state: Ints, copies: Ints, values: Ints) -> None:
+    """Writes the bits that need no look-up."""
+    for v in range(len(copies)):
+        values[copies[v, 0]] = copies[v, 3] if state[copies[v, 1]] == 1 else copies[v, 2]
+
+
+@inlined
+def _by_state(r: int, action: int, state: Ints, bits: Ints, parents: Ints) -> tuple[int, int]:
+    """(place in its table that action and state lead to, weight of the next parent)."""
+    place, weight = bits[r, 1] + bits[r, 2] * action, 1
+    for v in range(bits[r, 3], bits[r, 4]):
+        place += weight * state[parents[v]]
+        weight *= 2
+    return place, weight
+
+
+@compiled
+def sample_rules(states: Ints, actions: Ints, keys: Keys, rules: BitRules) -> tuple[Ints, NDArray[np.bool_]]:
+    """Draws next states int64 [B, F] and ``terminated`` bool [B]: bit i of row b at number i of key b, as ``samplers``."""
+    n_bits, k = states.shape[1], borrowed(rules)
+    table, bits, parents, copies, networks, room = k.table, k.bits, k.parents, k.copies, k.networks, room_for(k.networks)
+    drawn, ended, none = np.empty_like(states), np.zeros(len(states), dtype=np.bool_), np.zeros((1, 1), dtype=np.int64)
+    outcome, chances, conditioned = np.zeros(n_bits + 1, dtype=np.int64), room.chances, room.conditioned
+    for b in range(len(states)):
+        action, state = actions[b], states[b]
+        _copy(state, copies, outcome)
+        see_state(networks, room, state)
+        see_action(networks, room, state, action)
+        for r in range(len(bits)):
+            i = bits[r, 0]
+            if bits[r, 1] >= 0:
+                place, weight = _by_state(r, action, state, bits, parents)
+                for v in range(bits[r, 4], bits[r, 5]):
+                    place += weight * outcome[parents[v]]
+                    weight *= 2
+                one = table[place]
+            elif conditioned[i]:
+                one = ask(networks, room, i, action, 0, state, outcome, none[0], none)
+            else:
+                one = chances[i]
+            if one <= 0.0 or one >= 1.0:
+                outcome[i] = int(one >= 1.0)
+            else:
+                outcome[i] = int(uniform_at(keys[b], i) >= 1.0 - one)
+        drawn[b], ended[b] = outcome[:n_bits], outcome[n_bits] == 1
+    return drawn, ended
+
+
+class RulesWork(NamedTuple):
+    """Work space.
+
+    Attributes:
+        base: the outcome's settled bits, int64 [O]; -1 where open.
+        open: the open bits, int64 [O].
+        slot: the number of each open bit among them, int64 [O].
+        p: particles.
+        room: the networks'.
+    """
+
+    base: Ints
+    open: Ints
+    slot: Ints
+    p: Particles
+    room: Room
+
+
+@implements(work_for, BitRules)
+@compiled
+def rules_work(k: BitRules, n_grid: int) -> RulesWork:
+    """See compiled_model."""
+    n_outputs = len(k.bits) + len(k.copies)
+    return RulesWork(
+        np.empty(n_outputs, dtype=np.int64),
+        np.empty(n_outputs, dtype=np.int64),
+        np.empty(n_outputs, dtype=np.int64),
+        new_particles(n_grid, n_outputs, 2),
+        room_for(k.networks),
+    )
+
+
+@inlined
+def _by_outcome(q: int, place: int, weight: int, v: int, end: int, parents: Ints, base: Ints, slot: Ints, factors: Ints) -> int:
+    """Where the outcome's bits lead to from there, in the eyes of particle q; the parents are number v to ``end``."""
+    while v < end:
+        value = base[parents[v]]
+        if value < 0:
+            value = factors[q, slot[parents[v]]]
+        place += weight * value
+        weight *= 2
+        v += 1
+    return place
+
+
+@implements(outcomes, BitRules)
+@compiled
+def rules_outcomes(k: BitRules, work: RulesWork, state: Ints, n_grid: int, key: np.uint64, offset: float, out: Outcomes) -> int:
+    """See compiled_model."""
+    table, bits, parents, networks, room, base, slot = k.table, k.bits, k.parents, k.networks, work.room, work.base, work.slot
+    grid, total, still_open, p, chances, conditioned = (n_grid, key, offset), 0, work.open, work.p, room.chances, room.conditioned
+    factors, values = p.factors, np.empty(2, dtype=np.float64)
+    see_state(networks, room, state)
+    _copy(state, k.copies, base)
+    last = len(base) - 1
+    for action in range(k.n_actions):
+        see_action(networks, room, state, action)
+        n_open = 0
+        begin(p, n_grid, False, place_of(state))  # which bits are open is not known before
+        for r in range(len(bits)):
+            i, start, end, chance = bits[r, 0], bits[r, 4], bits[r, 5], 0.5
+            place, weight = _by_state(r, action, state, bits, parents)
+            shared = not (place < 0 and conditioned[i] and leans_on_open(networks, i, base))
+            for v in range(start, end):
+                shared = shared and base[parents[v]] >= 0
+            if shared:  # the same for all particles
+                if place < 0 and conditioned[i]:
+                    chance = settled_chance(ask(networks, room, i, action, 0, state, base, slot, factors))
+                elif place < 0:
+                    chance = settled_chance(chances[i])
+                else:
+                    chance = table[_by_outcome(0, place, weight, start, end, parents, base, slot, factors)]
+                if chance <= 0.0 or chance >= 1.0:
+                    base[i] = int(chance >= 1.0)
+                    continue
+            base[i], slot[i], still_open[n_open] = -1, n_open, i
+            if shared:
+                bit_chances(chance, values)
+                share_out(p, -1, i, n_open, values, 2, i == last, grid)
+            n_main, n_strata = p.state[MAIN], p.state[STRATA]
+            for j in range(0 if shared else n_main + n_strata):
+                q = n_grid + j if j < n_strata else j - n_strata  # strata first
+                if place < 0:
+                    chance = settled_chance(ask(networks, room, i, action, q, state, base, slot, factors))
+                else:
+                    chance = table[_by_outcome(q, place, weight, start, end, parents, base, slot, factors)]
+                bit_chances(chance, values)
+                share_out(p, q, i, n_open, values, 2, i == last, grid)
+            n_open += 1
+        out.counts[action] = write_outcomes(total, base, still_open[:n_open], p, n_grid, out)
+        out.left_out[action] = p.left[0]
+        total += out.counts[action]
+    return total

@@ -1,0 +1,510 @@
+"""A reward model fitted to observed rewards, for environments whose reward function is not available.
+
+Where no decision graph separates the rewards, a dense network predicts them; compiled code evaluates it, since a search scores
+thousands of transitions for a decision.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import Module, functional
+
+from mbagent.data import TransitionBatch
+from mbagent.models.dbn.reward_graphs import ClassGraphs, cells_in, check_graphs, class_chances, learn_classes
+from mbagent.models.neural.export import pack_layout
+from mbagent.models.neural.kernels import RELU, Floats32, Layout, activate, active_columns, add_products, add_rows
+from mbagent.models.neural.networks import Affine, Convolution, FactorCodec, cells_of
+from mbagent.models.neural.training import one_thread
+from mbagent.models.reward_changes import still_hold, triples, turn
+from mbagent.spaces import PlaneLayout
+from mbagent.types import Actions, Floats, Ints, States
+from mbagent_envs.jit import compiled
+
+HIDDEN = 64
+"""Hidden nodes."""
+
+
+class DenseReward(Module):
+    """One hidden layer over state, action and next state."""
+
+    def __init__(self, codec: FactorCodec, n_out: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.codec = codec
+        self.first = Affine(codec.n_inputs + codec.n_state_columns, HIDDEN, generator)
+        self.out = Affine(HIDDEN, n_out, generator)
+
+    def forward(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
+        """Class logits or a normalised reward [B, n_out]."""
+        after = self.codec.inputs(next_states, actions)[:, : self.codec.n_state_columns]
+        hidden = functional.relu(self.first(torch.cat((self.codec.inputs(states, actions), after), dim=1)))
+        result: Tensor = self.out(hidden)
+        return result
+
+
+class RewardWeights(NamedTuple):
+    """The weights of a ``DenseReward`` for compiled code.
+
+    Attributes:
+        layout: of the columns.
+        first: from columns of state, action and next state, [n, H].
+        bias: of the hidden nodes, [H].
+        last: to the outputs, padded to a multiple of four rows, [4 * m, H].
+        last_bias: likewise, [4 * m].
+        n_outputs: how many there are.
+    """
+
+    layout: Layout
+    first: Floats32
+    bias: Floats32
+    last: Floats32
+    last_bias: Floats32
+    n_outputs: int
+
+
+def pack_reward(network: DenseReward) -> RewardWeights:
+    """A network's present weights."""
+    with torch.no_grad():
+        first, bias = network.first.weight.numpy(), network.first.bias.numpy()
+        last, last_bias = network.out.weight.numpy(), network.out.bias.numpy()
+        more = -len(last) % 4
+        return RewardWeights(
+            pack_layout(network.codec),
+            np.ascontiguousarray(first.T),
+            bias.copy(),
+            np.pad(last, ((0, more), (0, 0))),
+            np.pad(last_bias, (0, more)),
+            len(last),
+        )
+
+
+@compiled
+def _outputs(weights: RewardWeights, states: Ints, actions: Ints, next_states: Ints, out: Floats32) -> None:
+    layout = weights.layout
+    room, n_inputs = states.shape[1] + layout.n_steps, layout.n_state_columns + layout.n_steps * layout.n_actions
+    columns, following = np.empty(2 * room, dtype=np.int64), np.empty(room, dtype=np.int64)
+    hidden = np.empty((1, len(weights.bias)), dtype=np.float32)
+    for b in range(len(states)):
+        n = active_columns(states, b, actions[b], layout, columns)
+        n_next = active_columns(next_states, b, actions[b], layout, following) - layout.n_steps
+        for i in range(n_next):
+            columns[n + i] = n_inputs + following[i]
+        hidden[0] = weights.bias
+        add_rows(weights.first, columns, n + n_next, hidden, 0)
+        activate(hidden, 0, hidden.shape[1], RELU)
+        out[b] = weights.last_bias
+        add_products(hidden, 1, hidden.shape[1], weights.last, out[b : b + 1])
+
+
+def reward_outputs(weights: RewardWeights, states: States, actions: Actions, next_states: States) -> Floats:
+    """Outputs of the network, float64 [M, n_outputs]; a row's do not depend on the rows beside it."""
+    out = np.empty((len(states), len(weights.last_bias)), dtype=np.float32)
+    rows = [np.ascontiguousarray(part, dtype=np.int64) for part in (states, actions, next_states)]
+    _outputs(weights, rows[0], rows[1], rows[2], out)
+    return out[:, : weights.n_outputs].astype(np.float64)
+
+
+MAX_CLASSES = 64
+"""Up to this many distinct rewards are told apart as classes; more are met by regression."""
+
+MAX_GRAPHS = 16
+"""Up to this many distinct rewards are told apart by decision graphs, where these do better than a network."""
+
+STEPS, BATCH, LEARNING_RATE = 1500, 256, 0.01
+
+FLOOR = 0.01
+"""A network's probabilities of rewards under this count as none, where that does not explain the rewards worse."""
+
+HELD_OUT = 0.15
+"""Share of episodes held out at first."""
+
+_CHUNK = 256
+
+
+CONTRARY, WRONG = 0.02, 0.1
+"""Shares of transitions with contrary rewards, and of held-out ones with a wrong reward, from which the agent says so."""
+
+
+@dataclass(frozen=True)
+class RewardReport:
+    """How well rewards can be told.
+
+    Attributes:
+        n_values: how many distinct rewards were met.
+        right: share of transitions whose reward comes out within 0.5% of the range.
+        held_out: the same of episodes that were held out at first, as measured then; NaN where there are none.
+        contrary: share of transitions that had another reward than most with the same (observation, action, next observation).
+        since: after how many transitions rewards changed, for the last time; 0 where they did not. The other figures are then of
+            the transitions whose rewards hold now.
+    """
+
+    n_values: int
+    right: float
+    held_out: float
+    contrary: float
+    since: int = 0
+
+    @property
+    def advice(self) -> str | None:
+        """What a user should know, in a sentence; None where all is well."""
+        if self.since:
+            return (
+                f"The environment's rewards changed after about {self.since:,} steps, so the agent plans with those observed "
+                "since then; when you change rewards, give the new goal with set_reward(fn), or call set_env(env), which starts "
+                "the rewards afresh."
+            )
+        if self.contrary > CONTRARY:
+            return (
+                f"{self.contrary:.1%} of rewards differ from what the same observation, action and next observation earned "
+                "before, so the reward is random or hangs on what is not observed (time, history); the agent plans with means. "
+                "mbagent.wrappers.History may show what is missing."
+            )
+        if self.held_out < 1.0 - WRONG:
+            return (
+                f"The learned reward is right in only {self.held_out:.1%} of the transitions of held-out episodes: learn from "
+                "more steps, or give the agent a reward function (set_reward)."
+            )
+        return None
+
+
+class LearnedReward:
+    """Predicts the reward of (state, action, next state): by decision graphs where these tell rewards apart, else by a network.
+
+    Args:
+        cardinalities: number of values of each state factor.
+        n_actions: number of enumerated actions.
+        planes: layout of the factors, where they form planes.
+        seed: of weights and batches.
+        parts: number of values of each part of an action; None: an action is one thing.
+    """
+
+    def __init__(
+        self,
+        cardinalities: tuple[int, ...],
+        n_actions: int,
+        planes: PlaneLayout | None = None,
+        seed: int = 0,
+        parts: Sequence[int] | None = None,
+    ) -> None:
+        """See the class."""
+        self._codec, self._planes, self._seed = FactorCodec(cardinalities, n_actions), planes, seed
+        self._parts = (n_actions,) if parts is None else tuple(parts)
+        self._values = np.zeros(1)
+        self._classes, self._floor = True, FLOOR
+        self._graphs: ClassGraphs | None = None
+        self._order = np.zeros(1)
+        self._build()
+
+    def _build(self) -> None:
+        generator = torch.Generator().manual_seed(self._seed)
+        n_out = len(self._values) if self._classes else 1
+        self._network: nn.Module
+        if self._planes is not None:
+            self._network = _PlaneReward(self._codec, self._planes, n_out, generator)
+        else:
+            self._network = DenseReward(self._codec, n_out, generator)
+        self._compile()
+
+    @one_thread()
+    def fit(self, rows: TransitionBatch) -> RewardReport:
+        """Learns from rows, in the order observed; where rewards changed, from those that hold now."""
+        report = self._learn(rows)
+        if report.right < 1.0 or report.held_out < 1.0:  # else no rows contradict each other
+            since, hold = self._changed(rows)
+            if since:
+                report = replace(self._learn(rows.select(hold)), since=since)
+        return report
+
+    def _learn(self, rows: TransitionBatch) -> RewardReport:
+        """Learns from most episodes first, to see how it does on the others, and then from all."""
+        values = np.unique(rows.rewards)
+        self._classes = len(values) <= MAX_CLASSES
+        self._values = values if self._classes else np.array([values.mean(), max(values.std(), 1e-6)])
+        self._graphs = None
+        self._build()
+        held_out, clearly, (distinct, weights) = float("nan"), False, _distinct(rows)
+        if len(values) > 1:
+            episodes = np.unique(rows.episodes)
+            chosen = np.random.default_rng(self._seed).permutation(episodes)[: int(HELD_OUT * len(episodes))]
+            held = np.isin(rows.episodes, chosen)
+            if held.any():
+                held_out, clearly = self._choose(rows.select(np.flatnonzero(~held)), rows.select(np.flatnonzero(held)))
+            if self._graphs is not None or not held.any():
+                self._graphs = self._as_graphs(rows)
+            trained = held.any() and self._graphs is None
+            if self._graphs is not None and not clearly:
+                misses = self._missed(rows) > 0 or (not held.any() and self._share_right(distinct, weights) < 1.0)
+                self._graphs = None if misses else self._graphs
+            if self._graphs is None:
+                self._train(distinct, torch.from_numpy(weights), STEPS // 2 if trained else STEPS)
+        right = self._share_right(distinct, weights)
+        return RewardReport(len(values), right, held_out, _contrary(rows))
+
+    def _choose(self, train: TransitionBatch, tests: TransitionBatch) -> tuple[float, bool]:
+        """Learns from some rows in the way that does better on others.
+
+        Graphs ask for evidence, so that they do not see a reward that was met once or twice; where held-out rows do not tell the
+        ways apart, that decides.
+
+        Returns:
+            (share of those that it gets right, whether graphs are clearly better).
+        """
+        graphs = self._graphs = self._as_graphs(train)
+        if graphs is None:
+            self._train_on(train)
+            return self._share_right(tests), False
+        missed, errors, right = self._missed(train), self._errors(tests), self._share_right(tests)
+        if right == 1.0 and missed == 0:
+            return right, False
+        self._graphs = None
+        self._train_on(train)
+        gain, told = self._errors(tests) - errors, missed <= self._missed(train)
+        spread = 2.0 * float(gain.std()) / len(gain) ** 0.5
+        # Where rewards are random, held-out rows can hardly tell means apart; graphs have those of the rows.
+        least = -spread if _contrary(train) > 0.0 else 0.0
+        if gain.mean() > spread or (gain.mean() >= least and told):
+            self._graphs = graphs
+            return right, bool(gain.mean() > spread)
+        return self._share_right(tests), False
+
+    def _train_on(self, rows: TransitionBatch) -> None:
+        distinct, weights = _distinct(rows)
+        self._train(distinct, torch.from_numpy(weights), STEPS)
+
+    def _missed(self, rows: TransitionBatch) -> int:
+        """Number of rows that earn something else than most do, and are told as if they did not.
+
+        What counts is the mean of all rows with the same observation, action and next observation: more cannot be told.
+        """
+        off, numbers = self._order[0], _numbered(rows)
+        means = (np.bincount(numbers, weights=rows.rewards) / np.bincount(numbers))[numbers]
+        told = np.abs(self(rows.states, rows.actions, rows.next_states) - off)
+        return int((told < 0.5 * np.abs(means - off)).sum())
+
+    def _as_graphs(self, rows: TransitionBatch) -> ClassGraphs | None:
+        """Decision graphs for the rewards of some rows; None where there are too many different ones."""
+        if not self._few:
+            return None
+        graphs, order = self._class_graphs(rows)
+        self._order = self._values[order]
+        return graphs
+
+    @property
+    def _few(self) -> bool:
+        """Whether there are few enough rewards for graphs."""
+        return self._classes and len(self._values) <= MAX_GRAPHS
+
+    def _class_graphs(self, rows: TransitionBatch) -> tuple[ClassGraphs, NDArray[np.int64]]:
+        """Decision graphs for the rewards of some rows, and which reward each class is, the commonest first."""
+        number = np.searchsorted(self._values, rows.rewards)
+        common = int(np.bincount(number, minlength=len(self._values)).argmax())
+        order = np.concatenate([[common], np.delete(np.arange(len(self._values)), common)])
+        return learn_classes(rows, np.argsort(order)[number], self._codec.cardinalities, self._parts, self._planes), order
+
+    def _chances(self, train: TransitionBatch, rows: TransitionBatch) -> Floats:
+        """Probability [N, K] of each reward, as graphs learned from some rows tell them of others."""
+        graphs, order = self._class_graphs(train)
+        parts = (np.ascontiguousarray(part) for part in (rows.states, rows.actions, rows.next_states))
+        return class_chances(graphs, len(order), *parts)[:, np.argsort(order)]
+
+    # ------------------------------------------------------------------ changes
+
+    def _changed(self, rows: TransitionBatch) -> tuple[int, NDArray[np.int64]]:
+        """After how many rows rewards changed for the last time, 0 for never, and which rows tell of them as they are now."""
+        order = np.argsort(rows.episodes, kind="stable")  # episode by episode, where several environments take turns
+        rows = rows.select(order)
+        keys, values, since = triples(rows), self._numbers(rows.rewards), 0
+        while found := self._turn(rows.select(slice(since, None)), keys[since:], values[since:]):
+            since += found
+        if not since:
+            return 0, order
+        hold = np.arange(len(rows)) >= since
+        if self._few:  # what was not observed again since holds, unless it is like something whose reward is another now
+            old, new = (self._chances(rows.select(part), rows) for part in (~hold, hold))
+            cells = np.unique(np.concatenate([old, new], axis=1), axis=0, return_inverse=True)[1].ravel()
+            hold[:since] = still_hold(cells, values, since) & ~np.isin(keys[:since], keys[since:])
+        return since, np.sort(order[hold])
+
+    def _numbers(self, rewards: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Numbers of rewards; where there are very many, those of like ones are the same."""
+        if self._classes:
+            return np.searchsorted(self._values, rewards)
+        return np.searchsorted(np.quantile(rewards, np.arange(1, MAX_GRAPHS) / MAX_GRAPHS), rewards)
+
+    def _turn(self, rows: TransitionBatch, keys: NDArray[np.int64], values: NDArray[np.int64]) -> int:
+        """The row from which on rewards are others than before, or 0."""
+        found = turn(keys, values, rows.episodes)
+        half = len(rows) // 2
+        if found or not self._few or np.isin(keys[half:], keys[:half]).mean() > 0.5:
+            return found
+        # Transitions that hardly ever come back are alike where graphs say the same of them; a covariate shift could look like a
+        # change then, so the rows since must predict better, too.
+        chances = self._chances(rows, rows)
+        found = turn(np.unique(chances, axis=0, return_inverse=True)[1].ravel(), values, rows.episodes)
+        if not found:
+            return 0
+        tested = (np.arange(len(rows)) >= found) & (np.arange(len(rows)) % 3 == 0)
+        tests, known = rows.select(tested), [~tested, ~tested & (np.arange(len(rows)) >= found)]
+        errors = [(self._chances(rows.select(train), tests) @ self._values - tests.rewards) ** 2 for train in known]
+        gain = errors[0] - errors[1]
+        return found if gain.mean() > 2.0 * gain.std() / len(gain) ** 0.5 else 0
+
+    def _errors(self, rows: TransitionBatch) -> Floats:
+        """Squared errors [N]."""
+        errors: Floats = (self(rows.states, rows.actions, rows.next_states) - rows.rewards) ** 2
+        return errors
+
+    def _share_right(self, rows: TransitionBatch, weights: NDArray[np.float32] | None = None) -> float:
+        reach = float(np.ptp(self._values)) if self._classes else 6.0 * float(self._values[1])
+        close = np.abs(self(rows.states, rows.actions, rows.next_states) - rows.rewards) <= 0.005 * max(reach, 1e-12)
+        return float(np.average(close, weights=weights))
+
+    def _train(self, rows: TransitionBatch, weights: Tensor, steps: int) -> None:
+        states, actions, next_states = (torch.from_numpy(part) for part in (rows.states, rows.actions, rows.next_states))
+        if self._classes:
+            targets = torch.from_numpy(np.searchsorted(self._values, rows.rewards))
+        else:
+            targets = torch.from_numpy((rows.rewards - self._values[0]) / self._values[1]).float()
+        generator = torch.Generator().manual_seed(self._seed + 1)
+        optimizer = torch.optim.Adam(self._network.parameters(), lr=LEARNING_RATE)
+        for step in range(steps):
+            for group in optimizer.param_groups:
+                group["lr"] = LEARNING_RATE * min(1.0, 2.0 * (1.0 - step / steps))
+            i = torch.randint(len(actions), (min(BATCH, len(actions)),), generator=generator)
+            out = self._network(states[i], actions[i], next_states[i])
+            if self._classes:
+                losses = functional.cross_entropy(out, targets[i], reduction="none")
+            else:
+                losses = (out[:, 0] - targets[i]) ** 2
+            optimizer.zero_grad(set_to_none=True)
+            (losses * weights[i]).mean().backward()  # type: ignore[no-untyped-call]
+            optimizer.step()
+        self._compile()
+        if self._classes:
+            errors = []
+            for self._floor in (0.0, FLOOR):
+                told = self(rows.states, rows.actions, rows.next_states)
+                errors.append(float((weights.double().numpy() * (told - rows.rewards) ** 2).sum()))
+            self._floor = FLOOR if errors[1] <= errors[0] else 0.0
+
+    def _compile(self) -> None:
+        """Packs the present weights for compiled code, where there is a kernel for the network."""
+        self._packed = pack_reward(self._network) if isinstance(self._network, DenseReward) else None
+
+    @one_thread()
+    @torch.inference_mode()
+    def __call__(self, states: States, actions: Actions, next_states: States) -> Floats:
+        """Expected rewards float64 [M]; a row's value does not depend on the rows beside it."""
+        if len(self._values) == 1:
+            return np.full(len(actions), self._values[0])
+        if self._graphs is not None:
+            parts_of = (np.ascontiguousarray(part, dtype=np.int64) for part in (states, actions, next_states))
+            return _weighed(class_chances(self._graphs, len(self._order), *parts_of), self._order)
+        if self._packed is not None:
+            return self._expected(torch.from_numpy(reward_outputs(self._packed, states, actions, next_states))).numpy()
+        parts = [np.zeros(0)]
+        for start in range(0, len(actions), _CHUNK):
+            rows = [np.ascontiguousarray(part[start : start + _CHUNK]) for part in (states, actions, next_states)]
+            n = len(rows[1])
+            # Always the same size: matrix products round differently in other sizes.
+            padded = [np.concatenate([part, np.zeros((_CHUNK - n, *part.shape[1:]), part.dtype)]) for part in rows]
+            out = self._network(*(torch.from_numpy(part) for part in padded))[:n]
+            parts.append(self._expected(out).numpy())
+        return np.concatenate(parts)
+
+    def _expected(self, out: Tensor) -> Tensor:
+        if not self._classes:
+            return out[:, 0].double() * float(self._values[1]) + float(self._values[0])
+        return torch.from_numpy(_weighed(out.double().softmax(dim=1).numpy(), self._values, self._floor))
+
+    def state_dict(self) -> dict[str, NDArray[Any]]:
+        """All weights, as arrays."""
+        known = {"values": self._values.copy(), "classes": np.array(self._classes), "floor": np.array(self._floor)}
+        if self._graphs is not None:
+            graphs = {f"graphs.{name}": array.copy() for name, array in self._graphs._asdict().items()}
+            return {**known, "order": self._order.copy(), **graphs}
+        return known | {f"network.{name}": value.numpy().copy() for name, value in self._network.state_dict().items()}
+
+    def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Takes over what ``state_dict`` returned.
+
+        Raises:
+            ValueError: the arrays are not those of such a reward.
+        """
+        self._values, self._classes = np.array(state["values"]), bool(state["classes"])
+        self._floor = float(state.get("floor", FLOOR))  # files of earlier versions have none
+        self._graphs = None
+        self._build()
+        if "order" in state:
+            self._order = np.array(state["order"], dtype=np.float64).reshape(-1)
+            own = {name.removeprefix("graphs."): array for name, array in state.items() if name.startswith("graphs.")}
+            cards, n_actions = self._codec.cardinalities, self._codec.n_actions
+            self._graphs = check_graphs(own, cards, n_actions, len(self._order), cells_in(self._planes, len(cards)))
+            return
+        prefix = "network."
+        weights = {k.removeprefix(prefix): torch.tensor(np.asarray(v)) for k, v in state.items() if k.startswith(prefix)}
+        self._network.load_state_dict(weights)
+        self._compile()
+
+
+class _PlaneReward(nn.Module):
+    """A convolution over the planes of both states; the maxima and sums of its features decide."""
+
+    def __init__(self, codec: FactorCodec, layout: PlaneLayout, n_out: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.codec, self.layout, channels = codec, layout, 16
+        n_planes = layout.channels * (1 if codec.all_binary else codec.width)
+        self.first = Convolution(2 * n_planes + 1, channels, 3, generator)
+        self.action = Affine(codec.n_actions, channels, generator)
+        self.second = Affine(2 * channels, 32, generator)
+        self.out = Affine(32, n_out, generator)
+
+    def forward(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
+        """Class logits or a normalised reward [B, n_out]."""
+        before, after = (cells_of(part, self.layout, self.codec) for part in (states, next_states))
+        ones = torch.ones_like(before[:, :1])
+        action = self.action(functional.one_hot(actions, self.codec.n_actions).to(before.dtype))
+        hidden = functional.relu(self.first(torch.cat((before, after, ones), dim=1)) + action[:, :, None, None])
+        pooled = torch.cat((hidden.amax(dim=(2, 3)), hidden.mean(dim=(2, 3))), dim=1)
+        result: Tensor = self.out(functional.relu(self.second(pooled)))
+        return result
+
+
+def _distinct(rows: TransitionBatch) -> tuple[TransitionBatch, NDArray[np.float32]]:
+    """Distinct (s, a, s', r), each weighted by its share among those of the same (s, a, s').
+
+    A rare transition then counts as much as a frequent one, and a random reward keeps its distribution.
+    """
+    keys, bits = triples(rows), np.ascontiguousarray(rows.rewards).view(np.int64)
+    _, first, counts = np.unique(np.stack([keys, bits], axis=1), axis=0, return_index=True, return_counts=True)
+    _, inverse = np.unique(keys[first], return_inverse=True)
+    shares = counts / np.bincount(inverse, weights=counts)[inverse]
+    return rows.select(first), shares.astype(np.float32)
+
+
+def _weighed(chances: Floats, values: Floats, floor: float = 0.0) -> Floats:
+    """Expected values [M] by chances [M, K]; of which those below ``floor`` count as none."""
+    p = np.where(chances < floor, 0.0, chances)
+    # Not a matrix product: it would round differently for other numbers of rows.
+    expected: Floats = (p / p.sum(axis=1, keepdims=True) * values).sum(axis=1)
+    return expected
+
+
+def _numbered(rows: TransitionBatch) -> NDArray[np.int64]:
+    """Numbers 0, 1, ... of the distinct (s, a, s'), int64 [N]."""
+    result: NDArray[np.int64] = np.unique(triples(rows), return_inverse=True)[1]
+    return result
+
+
+def _contrary(rows: TransitionBatch) -> float:
+    """Share of rows with another reward than the commonest of the same (s, a, s')."""
+    bits = np.ascontiguousarray(rows.rewards + 0.0, dtype=np.float64).view(np.int64)  # -0.0 is 0.0
+    pairs, counts = np.unique(np.stack([triples(rows), bits], axis=1), axis=0, return_counts=True)
+    first = np.flatnonzero(np.r_[True, pairs[1:, 0] != pairs[:-1, 0]])
+    return 1.0 - float(np.maximum.reduceat(counts, first).sum()) / len(rows.actions)

@@ -1,0 +1,511 @@
+"""Systematic and stratified sampling: the outcomes of a (state, action) from few draws, without losing rare ones.
+
+Variables are processed one after the other; each particle stands for the values chosen so far. Where all outcomes fit, they are
+listed with their exact probabilities. Elsewhere particles are stratified. The *main* particles are runs of grid points, of which
+each value of a variable gets its share. A value too rare for the grid gets a particle of its own, a *stratum*: all outcomes in
+which this is the first rare value. It carries the stratum's exact probability, and draws the later variables. So every rare value
+of every variable takes part, the weights add up to one, and expected values are unbiased (stratified sampling, Cochran 1977).
+Where there are more strata than slots, two are merged: one of them is kept, with probability proportional to its weight, and gets
+the weight of both. The stratum in which the episode ends is never merged with another.
+Shapes: n grid points, 2 n slots (main particles first, strata from slot n on), O open variables, K values.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from mbagent.models.neural.kernels import (
+    largest,
+)
+from mbagent.models.protocol import Successors
+from mbagent.types import Bools, Floats, Ints
+from mbagent_envs.jit import compiled, inlined
+from mbagent_envs.random_keys import derive, derive_one, uniform_at, uniforms
+
+
+@inlined
+def draw(values: Floats, n: int, u: float) -> int:
+    """Index drawn from the first ``n`` values, which sum to one: the inverse of their running sum at ``u`` in [0, 1)."""
+    chosen = 0
+    for k in range(n):
+        if values[k] > 0.0:
+            chosen = k
+            u -= values[k]
+            if u < 0.0:
+                break
+    return chosen
+
+
+NEGLIGIBLE = 0.01
+"""Probabilities under this share of the variable's largest are taken for noise of the fit, which planners would exploit: they
+count as 0. Decision graphs do so only where no observation stands behind them; networks cannot tell, and do so always."""
+
+RARE, TOGETHER = 0.05, 0.25
+"""Values of less than the first probability get strata of their own, those that together have less than the second."""
+
+ENOUGH = 4.0
+"""Values that so many grid points are expected for are not rare: points tell more of what comes with them than a stratum does."""
+
+CHUNK = 2048
+"""Rows worked on at once; bounds the memory."""
+
+MAIN, STRATA, EXACT, MERGES, PLACE = range(5)
+"""Entries of ``Particles.state``: numbers of main particles and of strata, whether all outcomes are listed, merges so far, and a
+number of the state, on which it depends which strata are merged: else the same would be missing everywhere."""
+
+_TAG = 1 << 32
+"""Variable number ``i`` with value ``k`` is stratum ``i * _TAG + k``; of whether the episode ends, ``-1 - k``."""
+
+_MERGE, _LATER = np.uint64(0x3E46E), np.uint64(0x1A7E5)
+"""Salts of the random numbers that decide between merged strata, and of those that strata draw with."""
+
+Found: TypeAlias = tuple[Ints, Ints, Bools, Floats, Floats]
+"""Outcomes of some rows: counts [B], states [M, F], terminated [M], probabilities [M]; and what ``Particles.left`` was, [B]."""
+
+Grid: TypeAlias = tuple[int, np.uint64, float]
+"""Number of grid points, the key of their random numbers, and the grid's offset; see ``start``."""
+
+
+FIRST, POINTS, TAG = range(3)
+"""Columns of ``Particles.grid``: lowest grid point, number of grid points, which stratum."""
+
+LOW, HIGH, MASS, SHARE = range(4)
+"""Columns of ``Particles.chances``: ends of the interval of [0, 1) that the points lie in; exact probability of the outcome so
+far, of a stratum all of its weight; probability that no value so far was rare, of a stratum its own probability."""
+
+
+class Particles(NamedTuple):
+    """The particles of one row. Few arrays: handing them from function to function costs time, and to compile that even more.
+
+    Attributes:
+        grid: see FIRST, int64 [2 n, 3].
+        chances: see LOW, [2 n, 4].
+        factors: values of the row's open variables so far, int64 [2 n, O], in order.
+        rare: probabilities of the values of a variable that are set apart, [K].
+        state: see MAIN, int64 [5].
+        left: probability of the strata that found no room, [1].
+    """
+
+    grid: Ints
+    chances: Floats
+    factors: Ints
+    rare: Floats
+    state: Ints
+    left: Floats
+
+
+@lru_cache(maxsize=4096)
+def start(seed: int) -> tuple[np.uint64, float]:
+    """The key of a seed and the grid's offset in [0, 1)."""
+    key = derive(int(seed) % 2**64, 0x5EED)
+    return key[0], float(uniforms(key, 1)[0, 0])
+
+
+@compiled
+def new_particles(n_grid: int, n_outputs: int, n_values: int) -> Particles:
+    """Room for a row's particles, over so many variables of so many values at most."""
+    return Particles(
+        np.empty((2 * n_grid, 3), dtype=np.int64),
+        np.empty((2 * n_grid, 4), dtype=np.float64),
+        np.empty((2 * n_grid, n_outputs), dtype=np.int64),
+        np.empty(n_values, dtype=np.float64),
+        np.zeros(5, dtype=np.int64),
+        np.zeros(1, dtype=np.float64),
+    )
+
+
+@inlined
+def begin(p: Particles, n_grid: int, exact: bool, place: int) -> None:
+    """One particle with all points. ``exact``: there is room to list all outcomes, at most 2 n. ``place``: see PLACE."""
+    p.grid[0, FIRST], p.grid[0, POINTS], p.chances[0, LOW], p.chances[0, HIGH], p.chances[0, MASS], p.chances[0, SHARE] = (
+        0,
+        n_grid,
+        0.0,
+        1.0,
+        1.0,
+        1.0,
+    )
+    p.state[MAIN], p.state[STRATA], p.state[EXACT], p.state[MERGES] = 1, 0, int(exact), 0
+    p.state[PLACE], p.left[0] = place, 0.0
+
+
+@compiled
+def place_of(state: Ints) -> int:
+    """A number of a state [F], see PLACE."""
+    total = np.uint64(0)
+    for f in range(len(state)):
+        total = total * np.uint64(31) + np.uint64(state[f] + 1)
+    return int(total >> np.uint64(2))
+
+
+@inlined
+def n_outcomes(p: Particles) -> int:
+    """Number of particles."""
+    return int(p.state[MAIN] + p.state[STRATA])
+
+
+@inlined
+def slot_of(p: Particles, i: int, n_grid: int) -> int:
+    """Slot of particle number i: main ones first."""
+    return int(i if i < p.state[MAIN] else n_grid + i - p.state[MAIN])
+
+
+@compiled
+def prune(values: Floats, n: int) -> None:
+    """Sets negligible probabilities to 0 and scales the rest to sum to one."""
+    top, total = 0.0, 0.0
+    for k in range(n):
+        top = max(top, values[k])
+    for k in range(n):
+        if values[k] < NEGLIGIBLE * top:
+            values[k] = 0.0
+        total += values[k]
+    for k in range(n):
+        values[k] /= total
+
+
+@compiled
+def settle(probs: Floats, b: int, outputs: Ints, base: Ints) -> None:
+    """Writes to ``base`` [O] the value of each factor of row b that has only one worth drawing, else -1."""
+    for i in range(len(outputs)):
+        if outputs[i] == 2:  # written out, since most factors of most worlds are settled bits
+            zero, one = probs[b, i, 0], probs[b, i, 1]
+            base[i] = 0 if one < NEGLIGIBLE * zero else (1 if zero < NEGLIGIBLE * one else -1)
+            continue
+        best = largest(probs, b, i, outputs[i])
+        base[i] = best
+        for k in range(outputs[i]):
+            if k != best and probs[b, i, k] >= NEGLIGIBLE * probs[b, i, best]:
+                base[i] = -1
+
+
+@inlined
+def bit_chances(one: float, values: Floats) -> None:
+    """Writes the distribution of a bit that is 1 with probability ``one``."""
+    values[0], values[1] = 1.0 - one, one
+
+
+@inlined
+def n_possible(values: Floats, start: int, n: int) -> int:
+    """How many of ``n`` numbers of ``values`` are above 0."""
+    count = 0
+    for k in range(start, start + n):
+        if values[k] > 0.0:
+            count += 1
+    return count
+
+
+@compiled
+def _set_apart(values: Floats, rare: Floats, n: int, n_grid: int) -> float:
+    """Moves the rare values [n] to ``rare`` [n], scales the others to sum to one; returns the probability of all rare ones.
+
+    Rare are those that are less probable than some bound, at most RARE or what ENOUGH says, and together have less than TOGETHER;
+    of equally probable ones all or none.
+    """
+    bound, total = min(RARE, ENOUGH / n_grid), TOGETHER
+    while total >= TOGETHER:
+        total = 0.0
+        for k in range(n):
+            if values[k] < bound:
+                total += values[k]
+        if total >= TOGETHER:
+            bound *= 0.5
+    for k in range(n):
+        rare[k] = 0.0
+        if total > 0.0:
+            if values[k] < bound:
+                rare[k], values[k] = values[k], 0.0
+            values[k] /= 1.0 - total
+    return total
+
+
+@compiled
+def share_out(p: Particles, only: int, unit: int, w: int, values: Floats, n: int, ends: bool, grid: Grid) -> None:
+    """Shares particles among the values of variable ``unit``, open variable number ``w``.
+
+    Args:
+        p: the particles.
+        only: slot of one particle, where probabilities depend on what it became so far (strata must be done before main ones);
+            -1 for all.
+        unit: number of the variable, which random numbers it draws with.
+        w: where its values are written to.
+        values: probability of each value, summing to one, overwritten, [n].
+        n: number of values.
+        ends: whether the variable tells if the episode ends.
+        grid: see Grid.
+    """
+    points, chances, factors, apart, state = p.grid, p.chances, p.factors, p.rare, p.state
+    n_grid, n_main, rare = grid[0], state[MAIN], 0.0
+    if state[EXACT]:
+        for q in range(n_main if only < 0 else 1):
+            _list_values(p, max(q, only), w, values, n)
+        return
+    for slot in range(n_grid, n_grid + state[STRATA]):
+        if only < 0 or slot == only:
+            factors[slot, w] = draw(values, n, uniform_at(derive_one(grid[1], _LATER + np.uint64(slot)), unit))
+    if only >= n_grid:
+        return
+    rare = _set_apart(values, apart, n, n_grid)
+    for i in range(n_main if only < 0 else 1):
+        q = max(i, only)
+        here = points[q, POINTS] / n_grid * chances[q, SHARE]
+        for k in range(n if rare > 0.0 else 0):
+            if apart[k] > 0.0:
+                _add_stratum(p, q, unit, k, w, here * apart[k], ends, grid)
+        chances[q, MASS] *= 1.0 - rare
+        chances[q, SHARE] *= 1.0 - rare
+        state[MAIN] = _split(p, q, state[MAIN], unit, w, values, n, grid)
+
+
+@compiled
+def _list_values(p: Particles, q: int, w: int, values: Floats, n: int) -> None:
+    """One particle for each possible value; the first keeps the slot."""
+    chances, factors, state = p.chances, p.factors, p.state
+    slot, mass, last = q, chances[q, MASS], state[MAIN]
+    for k in range(n):
+        if values[k] > 0.0:
+            if slot < 0:
+                slot = last
+                last += 1
+                for v in range(w):
+                    factors[slot, v] = factors[q, v]
+            factors[slot, w], chances[slot, MASS] = k, mass * values[k]
+            slot = -1
+    state[MAIN] = last
+
+
+@compiled
+def _split(p: Particles, q: int, n_live: int, i: int, w: int, values: Floats, n: int, grid: Grid) -> int:
+    """Shares the points of main particle ``q`` among the values of variable i; returns how many main ones there are.
+
+    The first value with a point keeps the slot; particles for further ones are appended.
+    """
+    points, chances, factors = p.grid, p.chances, p.factors
+    n_grid, key, offset = grid
+    if points[q, POINTS] == 1:
+        chosen = draw(values, n, uniform_at(derive_one(key, np.uint64(points[q, FIRST])), i))
+        factors[q, w] = chosen
+        chances[q, MASS] *= values[chosen]
+        return n_live
+    low, width, mass = chances[q, LOW], chances[q, HIGH] - chances[q, LOW], chances[q, MASS]
+    point, left, below = points[q, FIRST], points[q, POINTS], 0.0
+    slot, last = q, n - 1
+    while values[last] <= 0.0:
+        last -= 1
+    for k in range(last + 1):
+        lower = low + width * below
+        below += values[k]
+        upper = low + width * below
+        taken = left if k == last else min(max(math.ceil(upper * n_grid - offset) - point, 0), left)
+        if values[k] <= 0.0 or taken == 0:
+            continue
+        if slot < 0:
+            slot = n_live
+            n_live += 1
+            for v in range(w):
+                factors[slot, v] = factors[q, v]
+        points[slot, FIRST], points[slot, POINTS], factors[slot, w] = point, taken, k
+        chances[slot, LOW], chances[slot, HIGH], chances[slot, MASS], chances[slot, SHARE] = (
+            lower,
+            upper,
+            mass * values[k],
+            chances[q, SHARE],
+        )
+        slot = -1
+        point += taken
+        left -= taken
+    return n_live
+
+
+@compiled
+def _slot_for(p: Particles, tag: int, ends: bool, n_grid: int) -> int:
+    """Slot of a stratum: its own, a new one of mass 0, or that of another which it is to be merged with."""
+    points, chances, state = p.grid, p.chances, p.state
+    last, room = n_grid + int(state[STRATA]), n_grid if ends else max(1, n_grid - 1)  # one is kept for the end
+    for slot in range(n_grid, last):
+        if points[slot, TAG] == tag:
+            return slot
+        if points[slot, TAG] < 0:
+            room = n_grid
+    if state[STRATA] < room:
+        state[STRATA] += 1
+        chances[last, MASS] = 0.0
+        return last
+    slot = n_grid + int(state[MERGES] % state[STRATA])
+    for _ in range(state[STRATA]):
+        if (points[slot, TAG] < 0) != ends:
+            slot = slot + 1 if slot + 1 < last else n_grid
+    return slot
+
+
+@compiled
+def _add_stratum(p: Particles, q: int, unit: int, k: int, w: int, weight: float, ends: bool, grid: Grid) -> None:
+    """Adds main particle q with value k of a variable to the strata, with some weight."""
+    points, chances, factors, state = p.grid, p.chances, p.factors, p.state
+    n_grid, key, _ = grid
+    tag = -1 - k if ends else unit * _TAG + k
+    slot = _slot_for(p, tag, ends, n_grid)
+    before, total = chances[slot, MASS], chances[slot, MASS] + weight
+    if before > 0.0:
+        state[MERGES] += 1
+        kept = uniform_at(derive_one(key, _MERGE + np.uint64(state[PLACE])), state[MERGES]) * total >= weight
+        if points[slot, TAG] != tag:
+            p.left[0] += weight if kept else chances[slot, SHARE]
+            chances[slot, SHARE] = chances[slot, SHARE] if kept else weight
+        else:
+            chances[slot, SHARE] += weight
+        if kept:
+            chances[slot, MASS] = total
+            return
+    else:
+        chances[slot, SHARE] = weight
+    for v in range(w):
+        factors[slot, v] = factors[q, v]
+    factors[slot, w], chances[slot, MASS], points[slot, TAG] = k, total, tag
+
+
+@compiled
+def weigh(p: Particles, n_grid: int) -> None:
+    """Turns the particles' masses into their probabilities, summing to one.
+
+    Where all outcomes are listed they are exact. Else a main particle that was sure to be found keeps its own, and a less
+    probable one has that of a grid point: what it was found with (Hájek 1971: mass by the chance of being found, scaled).
+    """
+    points, chances, n_main, total = p.grid, p.chances, p.state[MAIN], 0.0
+    if not p.state[EXACT]:
+        wanted, weights = 0.0, 0.0
+        for q in range(n_main):
+            wanted += points[q, POINTS] / n_grid * chances[q, SHARE]
+            chances[q, MASS] = max(chances[q, MASS], chances[q, SHARE] / n_grid)
+            weights += chances[q, MASS]
+        for q in range(n_main):
+            chances[q, MASS] *= wanted / weights
+    for i in range(n_outcomes(p)):
+        total += chances[slot_of(p, i, n_grid), MASS]
+    for i in range(n_outcomes(p)):
+        chances[slot_of(p, i, n_grid), MASS] /= total
+
+
+@compiled
+def write(p: Particles, base: Ints, still_open: Ints, n_open: int, n_grid: int, total: int, found: Found) -> int:
+    """Writes a row's outcomes from number ``total`` on, the open factors' values filled in to ``base`` [O]; returns how many."""
+    _, states, terminated, probabilities, _ = found
+    n_factors = states.shape[1]
+    weigh(p, n_grid)
+    for i in range(n_outcomes(p)):
+        slot = slot_of(p, i, n_grid)
+        for w in range(n_open):
+            base[still_open[w]] = p.factors[slot, w]
+        for f in range(n_factors):
+            states[total + i, f] = base[f]
+        terminated[total + i] = base[n_factors] == 1
+        probabilities[total + i] = p.chances[slot, MASS]
+    return n_outcomes(p)
+
+
+@compiled
+def room(n_rows: int, n_grid: int, n_outputs: int) -> Found:
+    """Room for as many outcomes as there can be."""
+    most = 2 * n_rows * n_grid
+    return (
+        np.empty(n_rows, dtype=np.int64),
+        np.empty((most, n_outputs - 1), dtype=np.int64),
+        np.empty(most, dtype=np.bool_),
+        np.empty(most, dtype=np.float64),
+        np.zeros(n_rows, dtype=np.float64),
+    )
+
+
+@compiled
+def used(found: Found, total: int) -> Found:
+    """The part of the room that was used."""
+    counts, states, terminated, probabilities, left = found
+    return counts, states[:total], terminated[:total], probabilities[:total], left
+
+
+def assemble(parts: list[Found], n_outputs: int) -> Successors:
+    """Successors from the outcomes found in consecutive runs of rows."""
+    if not parts:
+        none = np.zeros((0, n_outputs - 1), dtype=np.int64)
+        return Successors(np.zeros(1, dtype=np.int64), none, np.zeros(0, dtype=np.bool_), np.zeros(0))
+    if len(parts) > 1:
+        counts, states, terminated, probabilities, _ = (np.concatenate(column) for column in zip(*parts, strict=True))
+    else:
+        counts, states, terminated, probabilities, _ = parts[0]
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return Successors(offsets, states, terminated, probabilities)
+
+
+def rows_at_once(n_samples: int, n_outputs: int) -> int:
+    """How many rows to work on at once."""
+    return max(1, min(CHUNK, (1 << 24) // (2 * n_samples * n_outputs)))
+
+
+def thin(full: Successors, n_samples: int, seed: int) -> Successors:
+    """Cuts rows with more than ``n_samples`` successors down to at most twice as many.
+
+    What is rare stays as long as there is room, and that the episode ends always does; see ``particles.py``.
+
+    Args:
+        full: all successors, with exact probabilities.
+        n_samples: grid points a row.
+        seed: which random numbers; the same for all rows.
+    """
+    counts = np.diff(full.offsets)
+    if counts.max(initial=0) <= n_samples:
+        return full
+    offsets = full.offsets.astype(np.int64)
+    counts, chosen, weights = _thinned(offsets, full.terminated, full.probabilities, (n_samples, *start(seed)))
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return Successors(offsets, full.states[chosen], full.terminated[chosen], weights)
+
+
+@compiled
+def _thinned(offsets: Ints, terminated: Bools, probabilities: Floats, grid: Grid) -> tuple[Ints, Ints, Floats]:
+    """Of each row, how many successors stay; of all of these, their numbers and probabilities."""
+    n_rows, n_grid, total, most = len(offsets) - 1, grid[0], 0, 0
+    for b in range(n_rows):
+        most = max(most, offsets[b + 1] - offsets[b])
+    p, values = new_particles(n_grid, 2, max(most, 2)), np.empty(max(most, 2), dtype=np.float64)
+    counts, room = np.empty(n_rows, dtype=np.int64), len(probabilities)
+    chosen, weights = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.float64)
+    for b in range(n_rows):
+        first, n = offsets[b], offsets[b + 1] - offsets[b]
+        counts[b] = n
+        if n <= n_grid:
+            for k in range(n):
+                chosen[total + k], weights[total + k] = first + k, probabilities[first + k]
+            total += n
+            continue
+        ends, ending = 0, 0.0
+        for k in range(first, first + n):
+            if terminated[k] and probabilities[k] > 0.0:
+                ends, ending = ends + 1, ending + probabilities[k]
+        others = n_possible(probabilities, first, n) - ends
+        begin(p, n_grid, False, 0)
+        p.factors[0, 0] = int(ends > 0)
+        if ends > 0 and others > 0:
+            bit_chances(ending, values)
+            share_out(p, -1, 0, 0, values, 2, True, grid)
+        n_main, n_strata = p.state[MAIN], p.state[STRATA]
+        for j in range(n_main + n_strata):
+            slot = n_grid + j if j < n_strata else j - n_strata  # strata first
+            left = 0.0
+            for k in range(n):
+                same = int(terminated[first + k]) == p.factors[slot, 0]
+                values[k] = probabilities[first + k] if same else 0.0
+                left += values[k]
+            for k in range(n):
+                values[k] /= left
+            share_out(p, slot, 1, 1, values, n, False, grid)
+        weigh(p, n_grid)
+        counts[b] = n_outcomes(p)
+        for i in range(counts[b]):
+            slot = slot_of(p, i, n_grid)
+            chosen[total + i], weights[total + i] = first + p.factors[slot, 1], p.chances[slot, MASS]
+        total += counts[b]
+    return counts, chosen[:total], weights[:total]

@@ -1,0 +1,420 @@
+"""Planners: value iteration on the reachable MDP (paper section 2), and tree search beyond it (paper section 4.1).
+
+Where the whole reachable MDP is small, it is solved once for each reward. Elsewhere a local MDP around each observation is
+solved, and Monte Carlo tree search goes on from its values.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbagent.models.mdp import StateGraph
+from mbagent.models.protocol import TransitionModel
+from mbagent.planning.fitted_value_iteration import Task, learn_values
+from mbagent.planning.flat_monte_carlo import random_returns
+from mbagent.planning.lookahead import grow_lookahead
+from mbagent.planning.planner import Plan, PlannerSettings, best_actions
+from mbagent.planning.racing import Way, best_way
+from mbagent.planning.search import MAX_KEPT, Paths, Rules, Tables, begin_wave, carry_over, empty_paths, end_wave, measure_spans
+from mbagent.planning.trajectories import Foresight, best_behaviour
+from mbagent.planning.value_function import LOWEST_KNOWN
+from mbagent.planning.value_iteration import Machine, Values, break_ties, doubt, score_edges, settle, solve, undecided
+from mbagent.types import Actions, Floats, Ints, Reward, States
+from mbagent_envs.random_keys import derive
+
+REHEARSED: dict[str, Any] = {"time_budget": None, "reuse_tree": False}
+"""Settings while ways to look ahead are compared: the outcome must hang on neither the clock nor the order."""
+
+ROOTS_AT_ONCE = 16
+"""Roots that are imagined around together; bounds the memory."""
+
+
+class Imagined(NamedTuple):
+    """What was imagined around R roots, and what follows from it.
+
+    Attributes:
+        graph: root r lies in group r.
+        nodes: int64 [R], the roots.
+        solution: values of the graph.
+        visits: [R, A], simulations through the roots' actions.
+        scores: [R, A], what the choice goes by.
+        tried: [N, A], simulations through all nodes' actions where behaviour goes by them; None where by values.
+    """
+
+    graph: StateGraph
+    nodes: Ints
+    solution: Values
+    visits: Floats
+    scores: Floats
+    tried: Floats | None = None
+
+
+class MachinePlanner:
+    """Acts greedily on the values of the reachable machine.
+
+    Where the machine reachable from the start states has at most ``max_states`` states it is generated once for the
+    model and solved once for each goal. A root outside of it gets a lookahead machine of its own.
+    """
+
+    def __init__(self, settings: PlannerSettings) -> None:
+        """Takes the settings; a model and a goal must follow."""
+        self.settings = settings
+        self._model: TransitionModel | None = None
+        self._goal: Reward | None = None
+        self._start: States | None = None
+        self._machine: Machine | None = None
+        self._imagined: StateGraph | None = None
+        self._way: Way | None = None
+        self._told = False
+
+    def set_model(self, model: TransitionModel, start_states: States) -> None:
+        """See Planner. The machine is generated at the next ``plan``."""
+        self._model, self._start, self._machine, self._imagined, self._way = model, start_states, None, None, None
+
+    def set_goal(self, goal: Reward) -> None:
+        """See Planner. The machine stays, its values go."""
+        if self._machine is not None:
+            self._machine.values = None  # before the goal changes: an interrupt must not leave values of another one
+        self._goal, self._way, self._told = goal, None, False
+
+    def look_ahead_as(self, other: MachinePlanner) -> None:
+        """Takes over how another planner of the same model and goal looks ahead, if that has found out."""
+        self._way = other._way
+
+    def plan(self, roots: States) -> Plan:
+        """See Planner."""
+        machine = self._solved_machine()
+        nodes = machine.find(roots)
+        n_actions = self._known_model().n_actions
+        values, visits = np.zeros((len(roots), n_actions)), np.zeros((len(roots), n_actions))
+        scores, known = np.zeros((len(roots), n_actions)), np.flatnonzero(nodes >= 0)
+        if len(known) and machine.graph is not None and machine.values is not None:
+            values[known] = machine.values.q[nodes[known]]
+            scores[known] = break_ties(machine.graph, machine.values.q, nodes[known], self.settings.gamma)
+            self._tell_doubt(machine.bounds, nodes[known], scores[known], values[known])
+        unknown = np.flatnonzero(nodes < 0)
+        for begin in range(0, len(unknown), ROOTS_AT_ONCE):
+            some = unknown[begin : begin + ROOTS_AT_ONCE]
+            found = self._imagine(roots[some])
+            values[some], visits[some], scores[some] = found.solution.q[found.nodes], found.visits, found.scores
+            if not self._told:
+                bounds = doubt(found.graph, found.solution, self.settings.gamma)
+                self._tell_doubt(bounds, found.nodes, scores[some], values[some])
+        return Plan(best_actions(scores), values, visits)
+
+    def _tell_doubt(self, bounds: Floats | None, nodes: Ints, scores: Floats, values: Floats) -> None:
+        """Warns, once for each goal, where rare outcomes that have no part in a plan could change it."""
+        if self._told or bounds is None or not undecided(scores, values, bounds[nodes]).any():
+            return
+        self._told, settings = True, self.settings
+        warnings.warn(
+            f"More outcomes are rare than plans have room for, so that others stand for some of them; values may be off by up to "
+            f"{bounds[nodes].max():.3g}, which could change the choice of an action: raise n_samples (now {settings.n_samples}) "
+            f"and lookahead_samples (now {settings.lookahead_samples}) in policy_kwargs.",
+            stacklevel=2,
+        )
+
+    def foresee(self, root: States) -> Foresight:
+        """What the plan from one root [1, F] rests on; see Foresight."""
+        machine = self._solved_machine()
+        nodes = machine.find(root)
+        if nodes[0] < 0 or machine.graph is None or machine.values is None:
+            return self._foresight(self._imagine(root), 0)
+        graph, solution = machine.graph, machine.values
+        scores = break_ties(graph, solution.q, nodes, self.settings.gamma)
+        nothing = np.zeros((1, graph.model.n_actions))
+        return self._foresight(Imagined(graph, nodes, solution, nothing, scores), int(graph.expanded.sum()))
+
+    def _foresight(self, found: Imagined, machine_states: int) -> Foresight:
+        plan = Plan(best_actions(found.scores), found.solution.q[found.nodes], found.visits)
+        behaviour = best_behaviour(found.graph, found.solution.q, self.settings.gamma, found.tried)
+        solution = found.solution
+        return Foresight(plan, found.graph, int(found.nodes[0]), solution.rewards, behaviour, solution.v, machine_states)
+
+    def _imagine(self, roots: States) -> Imagined:
+        """Imagines around each root [R, F]; here a lookahead machine, solved, without a search."""
+        graph, solution, nodes = self._lookahead(roots)
+        scores = break_ties(graph, solution.q, nodes, self.settings.gamma)
+        return Imagined(graph, nodes, solution, np.zeros_like(scores), scores)
+
+    def _empty_graph(self) -> StateGraph:
+        """A graph for the next roots; what the last one held is gone."""
+        if self._imagined is None:
+            self._imagined = StateGraph(self._known_model())
+        self._imagined.clear()
+        return self._imagined
+
+    def _lookahead(self, roots: States) -> tuple[StateGraph, Values, Ints]:
+        """A machine around each root [R, F], solved; root r is in group r. Returns (graph, values, root nodes)."""
+        way, graph, settings = self._chosen_way(), self._empty_graph(), self.settings
+        nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
+        grow_lookahead(graph, nodes, way.states, way.samples, settings.horizon, settings.seed)
+        return graph, solve(graph, self._known_goal(), settings.gamma, len(roots), way.leaf), nodes
+
+    def _chosen_way(self) -> Way:
+        """How to look ahead under this goal: as the settings say, with learned values at the edge or instead, if any."""
+        if self._way is None:
+            settings, start = self.settings, self._start
+            usual = Way(LOWEST_KNOWN, settings.lookahead_states, settings.lookahead_samples)
+            if settings.learn_values and start is not None and len(start):
+                usual = self._rehearse(usual, Task(self._known_model(), self._known_goal(), start, settings.gamma, settings.seed))
+            self._way = usual
+        return self._way
+
+    def _rehearse(self, usual: Way, task: Task) -> Way:
+        """Learns values for the goal, and finds out whether plans are best with them at the edge, without or only with them."""
+        settings = self.settings
+        leaf, met = learn_values(task)
+        if len(leaf.common) == 0:
+            return usual
+
+        def act(way: Way, states: States) -> Actions:
+            self._way = way
+            return best_actions(self._imagine(states).scores)
+
+        try:
+            self.settings = replace(settings, **REHEARSED)
+            ways = (usual._replace(leaf=leaf), usual, Way(leaf, 1, settings.n_samples))
+            return best_way(replace(task, start=met), ways, act)
+        finally:  # should the goal fail now, it is tried again
+            self.settings, self._way = settings, None
+
+    def _solved_machine(self) -> Machine:
+        if self._machine is None:
+            assert self._start is not None or self._model is None
+            model, start, settings = self._known_model(), self._start, self.settings
+            if start is None:
+                raise RuntimeError("The planner has no start states; call set_model first.")
+            self._machine = Machine(model, start, settings.max_states, settings.n_samples, settings.seed)
+        if self._machine.values is None:
+            self._machine.set_goal(self._known_goal(), self.settings.gamma)
+        return self._machine
+
+    def _known_model(self) -> TransitionModel:
+        if self._model is None:
+            raise RuntimeError("The planner has no model yet; call set_model first.")
+        return self._model
+
+    def _known_goal(self) -> Reward:
+        if self._goal is None:
+            raise RuntimeError("The planner has no goal yet; call set_goal first.")
+        return self._goal
+
+
+FINAL_SWEEPS = 100
+"""Sweeps of value iteration, at most, that settle the grown graph after the last simulation."""
+
+LEAF_SAMPLES = 4
+"""Draws for each (state, action) of a node that the search adds."""
+
+MAX_SEARCHED = 100_000
+"""Nodes at which a search with a time budget ends before its time; bounds the memory."""
+
+_SEARCH_SALT, _CARRIED_SALT = 0x5EA6C4, 0xCA1212
+
+
+class MctsPlanner(MachinePlanner):
+    """UCT on a graph of imagined states.
+
+    With ``leaf_values="machine"`` the search starts from the values of a lookahead machine around the root, each counting as
+    ``prior_visits`` visits, and goes on growing it where it looks promising; where the whole reachable machine is known and
+    solved there is nothing to search for.
+    With ``leaf_values="rollouts"`` it starts from nothing and values leaves by random play, as textbook UCT does.
+    """
+
+    def __init__(self, settings: PlannerSettings) -> None:
+        """Takes the settings; a model and a goal must follow."""
+        super().__init__(settings)
+        self._last: _Search | None = None
+        self._spare: StateGraph | None = None
+        self.settling = 0.0
+        """Seconds that the last search with a time budget took to settle a node, after its simulations."""
+
+    def set_model(self, model: TransitionModel, start_states: States) -> None:
+        """See Planner."""
+        super().set_model(model, start_states)
+        self._last, self._spare = None, None
+
+    def set_goal(self, goal: Reward) -> None:
+        """See Planner."""
+        super().set_goal(goal)
+        self._last = None
+
+    def forget(self) -> None:
+        """Drops what was kept of the last decision (with ``reuse_tree``)."""
+        self._last = None
+
+    def plan(self, roots: States) -> Plan:
+        """See Planner."""
+        if len(roots) > 1:
+            self._last = None
+        if self.settings.leaf_values == "machine":
+            return super().plan(roots)
+        found = self._imagine(roots)
+        return Plan(best_actions(found.scores), found.solution.q[found.nodes], found.visits)
+
+    def foresee(self, root: States) -> Foresight:
+        """See MachinePlanner."""
+        return super().foresee(root) if self.settings.leaf_values == "machine" else self._foresight(self._imagine(root), 0)
+
+    def _imagine(self, roots: States) -> Imagined:
+        """Searches from each root [R, F]."""
+        settings = self.settings
+        deadline = None if settings.time_budget is None else time.perf_counter() + len(roots) * settings.time_budget
+        search = self._carried_on(roots) if settings.reuse_tree else None
+        if search is None:
+            begin = self._lookahead if settings.leaf_values == "machine" else self._bare_roots
+            graph, solution, nodes = begin(roots)
+            search = _Search(self, graph, _first_tables(solution, nodes), nodes)
+        found = search.run(deadline)
+        if settings.reuse_tree and len(roots) == 1:
+            self._last = search
+        return found
+
+    def _carried_on(self, roots: States) -> _Search | None:
+        """The last decision's search, from a new root on; None where it knows too little of it, or is too large."""
+        last, self._last = self._last, None  # should the goal fail now, nothing half done is kept
+        if last is None or len(roots) != 1 or len(last.graph) > MAX_KEPT:
+            return None
+        root = int(last.graph.find(roots)[0])
+        if root < 0 or not last.graph.expanded[root]:
+            return None
+        graph = self._spare = self._spare if self._spare is not None else StateGraph(self._known_model())
+        tables = carry_over(last.graph, last.tables, root, graph)
+        if self.settings.leaf_values == "machine" and 2 * graph.expanded.sum() < self._chosen_way().states:
+            return None
+        self._imagined, self._spare = graph, last.graph
+        return _Search(self, graph, tables, np.zeros(1, dtype=np.int64), last.decision + 1)
+
+    def _bare_roots(self, roots: States) -> tuple[StateGraph, Values, Ints]:
+        """As ``_lookahead``: the roots with their successors, all worth nothing yet."""
+        graph = self._empty_graph()
+        nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
+        graph.expand(nodes, self.settings.n_samples, self.settings.seed)
+        nothing = np.zeros((len(graph), graph.model.n_actions))
+        rewards = score_edges(graph, self._known_goal())
+        return graph, Values(nothing[:, 0].copy(), nothing, rewards, np.zeros(len(roots))), nodes
+
+
+class _Search:
+    """One batch of searches, one for each root; the roots' parts of the graph do not touch."""
+
+    def __init__(self, planner: MctsPlanner, graph: StateGraph, tables: Tables, roots: Ints, decision: int = 0) -> None:
+        self.planner, self.graph, self.tables, self.roots, self.decision = planner, graph, tables, roots, decision
+        settings = self.settings = planner.settings
+        rollouts = settings.leaf_values == "rollouts"
+        prior = 0.0 if rollouts else settings.prior_visits
+        # What is carried on must not meet the very luck that it was made of.
+        key = derive(settings.seed, _CARRIED_SALT, decision)[0] if decision else _key(settings.seed, 0)
+        self.rules = Rules(settings.gamma, settings.c_uct, prior, rollouts, settings.backup == "mean", key)
+        if not (rollouts and decision):
+            measure_spans(graph.arrays, roots, self.tables)
+
+    def run(self, deadline: float | None = None) -> Imagined:
+        """Runs all simulations, or those that there is time for; ``deadline`` is a value of ``time.perf_counter``."""
+        if deadline is not None:
+            return self._run_until(deadline)
+        settings, done = self.settings, 0
+        wave = min(settings.wave, settings.num_simulations)
+        paths, leaves = empty_paths(len(self.roots), wave, settings.horizon), np.empty(2 * len(self.roots) * wave, dtype=np.int64)
+        while done < settings.num_simulations:
+            if settings.num_simulations - done < wave:
+                wave = settings.num_simulations - done
+                paths = empty_paths(len(self.roots), wave, settings.horizon)
+            self._wave(paths, leaves, done)
+            done += wave
+        return self._result()
+
+    def _run_until(self, deadline: float) -> Imagined:
+        """Runs waves, one at least, until another one and what comes after the last would not be done in time."""
+        wave, done, now = self.settings.wave, 0, time.perf_counter()
+        paths = empty_paths(len(self.roots), wave, self.settings.horizon)
+        leaves = np.empty(2 * len(self.roots) * wave, dtype=np.int64)
+        last = 0.0
+        while done == 0 or (now + last + self.planner.settling * len(self.graph) < deadline and len(self.graph) < MAX_SEARCHED):
+            began = now
+            self._wave(paths, leaves, done)
+            done, now = done + wave, time.perf_counter()
+            last = now - began
+        found = self._result()
+        self.planner.settling = (time.perf_counter() - now) / len(self.graph)
+        return found
+
+    def _result(self) -> Imagined:
+        graph, roots, t = self.graph, self.roots, self.tables
+        n, m, visits = len(graph), graph.n_edges, self.tables.root_visits
+        solution = Values(t.v[:n], t.q[:n], t.rewards[:m], t.frontier, t.leaf)
+        if self.settings.backup == "mean":
+            return Imagined(graph, roots, solution, visits, visits + 1e-6 * _unit(t.q[roots]), t.visits[:n])
+        settle(graph, solution, self.settings.gamma, FINAL_SWEEPS)
+        return Imagined(graph, roots, solution, visits, break_ties(graph, solution.q, roots, self.settings.gamma))
+
+    def _wave(self, paths: Paths, leaves: Ints, done: int) -> None:
+        """A wave of simulations: one call of the model, one of the goal."""
+        graph, rules = self.graph, self.rules
+        n, n_widened = begin_wave(graph.arrays, self.roots, self.tables, rules, done, paths, leaves)
+        n_nodes, n_edges, first = len(graph), graph.n_edges, paths.leaves.size
+        draws = self.settings.n_samples if rules.rollouts else LEAF_SAMPLES
+        graph.expand(leaves[:n], draws, int(_key(self.settings.seed, done + 1)))
+        self._make_room()
+        self.tables.rewards[n_edges : graph.n_edges] = score_edges(graph, self.planner._known_goal(), n_edges)
+        ends = self._rollouts(paths, done) if rules.rollouts else np.empty(paths.ends.shape)
+        widened = leaves[first : first + n_widened]
+        end_wave(graph.arrays, self.roots, self.tables, rules, n_nodes, leaves[:n], widened, paths, ends)
+
+    def _make_room(self) -> None:
+        """Lengthens the tables to the graph's length."""
+        tables, n, m = self.tables, len(self.graph), self.graph.n_edges
+        if len(tables.v) < n:
+            v, q, visits, counted = (_longer(table, 2 * n) for table in tables[:4])
+            tables = tables._replace(v=v, q=q, visits=visits, counted=counted)
+        if len(tables.rewards) < m:
+            tables = tables._replace(rewards=_longer(tables.rewards, 2 * m))
+        self.tables = tables
+
+    def _rollouts(self, paths: Paths, done: int) -> Floats:
+        """Value [R, W] of the node each simulation ended at, by random play."""
+        values, settings = np.zeros(paths.ends.shape), self.settings
+        alive = paths.ends >= 0
+        simulation = np.broadcast_to(done + np.arange(paths.ends.shape[1]), paths.ends.shape)[alive]
+        keys = derive(settings.seed, _SEARCH_SALT, simulation)
+        states = self.graph.states[paths.ends[alive]]
+        model, goal = self.planner._known_model(), self.planner._known_goal()
+        values[alive] = random_returns(model, goal, states, keys, settings.horizon, settings.gamma)
+        return values
+
+
+def _first_tables(solution: Values, roots: Ints) -> Tables:
+    """Tables before the first simulation."""
+    q, spread = solution.q, solution.v[roots]
+    return Tables(
+        solution.v, q, np.zeros_like(q), np.zeros_like(q), solution.rewards, solution.frontier,
+        np.zeros((len(roots), q.shape[1])), np.ones(len(roots)), np.stack([spread, spread], axis=1), solution.leaf,
+    )  # fmt: skip
+
+
+@lru_cache(maxsize=4096)
+def _key(seed: int, wave: int) -> np.uint64:
+    """Key of the search's luck (0), and of what the wave after ``wave - 1`` simulations imagines."""
+    key: np.uint64 = (derive(seed, _SEARCH_SALT) if wave == 0 else derive(seed, _SEARCH_SALT, wave))[0]
+    return key
+
+
+def _longer(table: NDArray[np.float64], size: int) -> Floats:
+    longer = np.empty((size, *table.shape[1:]))
+    longer[: len(table)] = table
+    return longer
+
+
+def _unit(values: Floats) -> Floats:
+    """Values [R, A] brought to 0 ... 1 by row, for breaking ties."""
+    low, high = values.min(axis=1, keepdims=True), values.max(axis=1, keepdims=True)
+    unit: Floats = (values - low) / np.maximum(high - low, 1e-12)
+    return unit

@@ -1,0 +1,98 @@
+"""Compiled functions work where nothing can be kept on disk, and one warning says so."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from importlib import util
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mbagent_envs import jit
+
+ROOT = Path(__file__).parents[2]
+DOUBLE = """
+from mbagent_envs.jit import compiled
+
+@compiled
+def double(x):
+    return 2 * x
+"""
+
+
+def run(package: str, installed: Path, cache: str) -> subprocess.CompletedProcess[str]:
+    """Imports a package and calls a compiled function in a process that finds no home folder to write to."""
+    # Nobody, not even root, can make a folder below a file, nor one of a name that a file has.
+    home = {"HOME": os.devnull, "XDG_CACHE_HOME": f"{os.devnull}/cache", "PYTHONPATH": str(installed), "NUMBA_CACHE_DIR": cache}
+    code = f"import numpy, {package}; from mbagent_envs.random_keys import mix; print({package}.__file__, mix(numpy.uint64(1)))"
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, env={**os.environ, **home}, cwd=installed, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the packages in folders that no compiled function can be kept in."""
+    folder = tmp_path_factory.mktemp("installed")
+    for package in (ROOT / "mbagent", ROOT / "envs" / "mbagent_envs"):
+        shutil.copytree(package, folder / package.name, ignore=shutil.ignore_patterns("__pycache__"))
+    for inside in [path for path in folder.rglob("*") if path.is_dir()]:
+        (inside / "__pycache__").write_text("")
+    return folder
+
+
+@pytest.mark.parametrize(("package", "cache"), [("mbagent", ""), ("mbagent_envs", f"{os.devnull}/numba")])
+def test_packages_work_where_nothing_can_be_written_with_one_warning(installed: Path, package: str, cache: str) -> None:
+    done = run(package, installed, cache)
+    assert done.returncode == 0, done.stderr
+    assert str(installed) in done.stdout
+    assert done.stderr.count("Warning") == 1
+    assert "set the environment variable NUMBA_CACHE_DIR to a writable folder" in done.stderr
+
+
+def test_a_writable_folder_for_numba_is_used_without_a_warning(installed: Path, tmp_path: Path) -> None:
+    done = run("mbagent_envs", installed, str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert not done.stderr
+    assert list(tmp_path.rglob("*.nbi"))
+
+
+@pytest.fixture
+def double(tmp_path: Path) -> Iterator[Callable[[Any], Any]]:
+    """A compiled function in a folder of its own."""
+    (tmp_path / "doubling.py").write_text(DOUBLE)
+    spec = util.spec_from_file_location("doubling", tmp_path / "doubling.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    jit._warn_uncached.cache_clear()
+    yield module.double
+    jit._warn_uncached.cache_clear()
+
+
+def test_a_folder_that_cannot_be_written_to_any_more_stops_nothing(double: Callable[[Any], Any], tmp_path: Path) -> None:
+    shutil.rmtree(tmp_path / "__pycache__")
+    (tmp_path / "__pycache__").write_text("")
+    with pytest.warns(RuntimeWarning, match="NUMBA_CACHE_DIR"):
+        assert double(2) == 4
+    assert double(0.5) == 1.0  # no second warning
+
+
+def test_a_full_disk_stops_nothing(double: Callable[[Any], Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*args: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.warns(RuntimeWarning, match="NUMBA_CACHE_DIR"):
+        assert double(2) == 4
+
+
+def test_damaged_files_stop_nothing(double: Callable[[Any], Any], tmp_path: Path) -> None:
+    assert double(2) == 4
+    (index,) = (tmp_path / "__pycache__").glob("*.nbi")
+    index.write_bytes(b"")
+    with pytest.warns(RuntimeWarning, match="NUMBA_CACHE_DIR"):
+        assert double(0.5) == 1.0
