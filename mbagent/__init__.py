@@ -5,7 +5,7 @@ Importing this package registers the games ``mbagent/GeyserRunner-v0``, ``mbagen
 """
 
 import mbagent_envs
-from mbagent import wrappers
+from mbagent import moved, wrappers
 from mbagent.agent import ModelLearningAgent
 from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.explain import Explanation, Future, Step
@@ -16,6 +16,8 @@ from mbagent.rewards import RewardFn
 from mbagent.spaces import ActionEnumeration, FactoredSpace
 
 __version__ = "0.1.0"
+
+moved.install()
 
 __all__ = [
     "ActionEnumeration",

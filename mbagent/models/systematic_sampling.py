@@ -18,13 +18,20 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from mbagent.models.neural.kernels import (
-    largest,
-)
 from mbagent.models.protocol import Successors
 from mbagent.types import Bools, Floats, Ints
 from mbagent_envs.jit import compiled, inlined
 from mbagent_envs.random_keys import derive, derive_one, uniform_at, uniforms
+
+
+@inlined
+def largest(probs: Floats, b: int, i: int, n: int) -> int:
+    """The likeliest of the ``n`` values of factor i in row b; the lowest of equals."""
+    best = 0
+    for k in range(1, n):
+        if probs[b, i, k] > probs[b, i, best]:
+            best = k
+    return best
 
 
 @inlined

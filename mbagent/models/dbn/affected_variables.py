@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 from mbagent.models.dbn.arrays import Graphs, distributions, meets, n_columns, show, with_rest, without_noise
 from mbagent.models.dbn.features import Acts, Layout
 from mbagent.models.dbn.sampling import only_possible
-from mbagent.models.systematic_sampling import (
-    NEGLIGIBLE,
-)
+from mbagent.models.systematic_sampling import NEGLIGIBLE
 from mbagent.types import Bools, Floats, Ints, Words
 from mbagent_envs.jit import compiled, inlined
 

@@ -19,11 +19,10 @@ from mbagent.models.neural.kernels import (
     copy_row,
     count_below,
     finish,
-    largest,
     trusted,
 )
 from mbagent.models.neural.sampling import draw_at
-from mbagent.models.systematic_sampling import draw
+from mbagent.models.systematic_sampling import draw, largest
 from mbagent.types import Floats, Ints, Keys
 from mbagent_envs.jit import borrowed, compiled, inlined, vectorised
 from mbagent_envs.random_keys import derive_one, fill_row

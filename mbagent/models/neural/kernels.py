@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent.models.systematic_sampling import largest
 from mbagent.types import Floats, Ints
 from mbagent_envs.jit import compiled, inlined, vectorised
 
@@ -480,16 +481,6 @@ def dense_logits(states: Ints, actions: Ints, layout: Layout, dense: DenseWeight
                     for k in range(layout.outputs[i]):
                         logits[first + r, i, k] = columns[r, start + k]
     return logits
-
-
-@inlined
-def largest(probs: Floats, b: int, i: int, n: int) -> int:
-    """The likeliest of the ``n`` values of factor i in row b; the lowest of equals."""
-    best = 0
-    for k in range(1, n):
-        if probs[b, i, k] > probs[b, i, best]:
-            best = k
-    return best
 
 
 @inlined

@@ -27,7 +27,6 @@ from mbagent.models.neural.kernels import (
     add_next,
     copy_row,
     finish,
-    largest,
     next_place,
     trusted,
 )
@@ -41,6 +40,7 @@ from mbagent.models.systematic_sampling import (
     assemble,
     begin,
     draw,
+    largest,
     new_particles,
     place_of,
     prune,

@@ -1,0 +1,122 @@
+"""Module paths of the version before, which work for one more version with a DeprecationWarning."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+from typing import Any
+
+_PACKAGE = "mbagent."
+
+_FORMERLY = {
+    "agent": "pruned reporting",
+    "checkpoint": "persistence saving",
+    "data": "experience transitions",
+    "environments": "subprocesses wrapping",
+    "explain": "explanations",
+    "rewards": "goals",
+    "spaces": "leaves",
+    "types": "planning.goal",
+    "exploration.controllability": "steering",
+    "exploration.visit_counts": "visits",
+    "models.base": "models.known",
+    "models.dbn": "models.graphs",
+    "models.markov_test models.held_out": "models.memory",
+    "models.mdp": "models.reachable models.state_graph",
+    "models.model_error": "models.trust",
+    "models.overloads": "models.compiled_model",
+    "models.registry": "models.factory",
+    "models.reward": "learned_reward models.reward_kernel",
+    "models.reward_changes": "reward_changes",
+    "models.systematic_sampling": "models.particles models.thinning",
+    "models.tabular": "models.table",
+    "planning.fitted_value_iteration": "planning.fitted_values planning.pair_regression",
+    "planning.flat_monte_carlo": "planning.rollouts",
+    "planning.lookahead": "planning.growing",
+    "planning.planners": "planning.machine_planner planning.mcts",
+    "planning.racing": "planning.rehearsal",
+    "planning.search": "planning.reuse planning.tree planning.waves",
+    "planning.trajectories": "planning.foresight",
+    "planning.value_function": "planning.leaf_values",
+    "models.dbn.affected_variables": "models.graphs.ending models.graphs.lean",
+    "models.dbn.arrays": "models.graphs.compiled",
+    "models.dbn.change_points": "models.graphs.recency",
+    "models.dbn.effects": "models.graphs.manners models.graphs.partners",
+    "models.dbn.expander": "models.graphs.expanding",
+    "models.dbn.features": "models.graphs.acts models.graphs.units",
+    "models.dbn.fitting": "models.graphs.conditioner models.graphs.events models.graphs.fitting",
+    "models.dbn.grounding": "models.graphs.instantiate",
+    "models.dbn.invariants": "models.graphs.laws",
+    "models.dbn.large_data": "models.graphs.looks models.graphs.zoom",
+    "models.dbn.leaf_prior": "models.graphs.leaves",
+    "models.dbn.model": "models.graphs.model models.graphs.parents",
+    "models.dbn.mutex": "models.graphs.couplings models.graphs.exclusive",
+    "models.dbn.plane_features": "models.graphs.windows",
+    "models.dbn.planes": "models.graphs.channels models.graphs.local models.graphs.placed",
+    "models.dbn.predictions": "models.graphs.predictions",
+    "models.dbn.reward_graphs": "models.graphs.transition_classes",
+    "models.dbn.sampling": "models.graphs.draws",
+    "models.dbn.score": "models.graphs.evidence",
+    "models.dbn.serialization": "models.graphs.arrays",
+    "models.dbn.smoothing": "models.graphs.habits",
+    "models.dbn.split_search": "models.graphs.greedy models.graphs.pairs",
+    "models.dbn.splits": "models.graphs.search",
+    "models.dbn.successors": "models.graphs.listing models.graphs.whole",
+    "models.neural.bit_kernels": "models.bit_networks models.causal_bits",
+    "models.neural.connections": "models.pruning",
+    "models.neural.export": "models.packing",
+    "models.neural.forecasts": "models.forecasts",
+    "models.neural.gibbs": "models.sweep_blocks models.sweeps",
+    "models.neural.influence": "models.modules",
+    "models.neural.kernels": "models.arithmetic models.kernels",
+    "models.neural.network_pair": "models.config models.network_pair",
+    "models.neural.networks": "models.networks models.plane_strings models.planes",
+    "models.neural.plane_kernels": "models.plane_kernels",
+    "models.neural.pruning": "models.evidence models.retraining",
+    "models.neural.sampling": "models.samplers",
+    "models.neural.sampling models.systematic_sampling": "models.systematic",
+    "models.neural.sparse": "models.sparse_networks",
+    "models.neural.training": "models.training",
+    "models.neural.truth_tables": "models.bit_rules models.tabulate",
+}
+"""Present modules, separated by spaces where an old one was divided: the old modules that they hold now."""
+
+MOVED = {
+    _PACKAGE + old: tuple(_PACKAGE + name for name in new.split()) for new, olds in _FORMERLY.items() for old in olds.split()
+}
+"""Old module path: the paths where its names are now."""
+
+
+class _OldPaths(MetaPathFinder, Loader):
+    """Finds the old paths, and only those: it comes after all other finders."""
+
+    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+        """See MetaPathFinder."""
+        if fullname not in MOVED:
+            return None
+        return ModuleSpec(fullname, self, is_package=any(other.startswith(f"{fullname}.") for other in MOVED))
+
+    def exec_module(self, module: ModuleType) -> None:
+        """See Loader."""
+        places = MOVED[module.__name__]
+        warnings.warn(f"{module.__name__} has moved to {' and '.join(places)}.", DeprecationWarning, stacklevel=2)
+
+        def find(name: str) -> Any:
+            for place in () if name.startswith("__") else places:
+                found = importlib.import_module(place)
+                if hasattr(found, name):
+                    return getattr(found, name)
+            raise AttributeError(f"{module.__name__} has moved to {' and '.join(places)}, and has no {name!r} there.")
+
+        vars(module)["__getattr__"] = find
+
+
+def install() -> None:
+    """Makes the old paths importable."""
+    if not any(isinstance(finder, _OldPaths) for finder in sys.meta_path):
+        sys.meta_path.append(_OldPaths())
