@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, cast, runtime_checkable
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 import torch
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import safe_mean
+from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 from stable_baselines3.common.vec_env import VecEnv
 
+from mbagent import checkpoint
 from mbagent.arguments import (
     check_callback,
     check_count,
@@ -25,179 +24,29 @@ from mbagent.arguments import (
     check_exploration,
     check_learning_rate,
     check_model,
+    check_overrides,
     check_policy,
     check_seed,
     check_timesteps,
     fitting_model,
     planner_settings,
+    policy_name,
 )
-from mbagent.checkpoint import SavableAlgorithm
+from mbagent.checkpoint import SETTINGS, AgentState, space_from_json, space_to_json
 from mbagent.data import Experience, ExperienceRecorder, TransitionDataset, distinct_rows, warn_of_forgetting
-from mbagent.environments import ENDED, has_ended, naming_ended_processes, step, wrap_env
+from mbagent.environments import EnvironmentAlgorithm, step
 from mbagent.explain import Explanation, explain
 from mbagent.exploration.strategies import EXPLORATIONS, Exploration, Watching, catch_up
+from mbagent.files import Target
 from mbagent.models.base import FitReport
-from mbagent.models.neural.connections import PruningConfig, check_fraction
+from mbagent.models.neural.connections import PruningConfig, check_fraction, prunable
 from mbagent.models.protocol import TransitionModel
 from mbagent.models.registry import build_model
 from mbagent.models.reward import LearnedReward
 from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
 from mbagent.rewards import GoalBook, RewardFn
 from mbagent.spaces import ActionEnumeration, FactoredSpace
-
-if TYPE_CHECKING:
-    pass
-
-
-def check_progress(show: bool) -> None:
-    """Whether a progress bar can be shown, if one is asked for.
-
-    Raises:
-        ImportError: a package is missing; the message names the pip line.
-    """
-    if not show:
-        return
-    try:
-        import rich  # noqa: F401, PLC0415 - optional
-        import tqdm  # noqa: F401, PLC0415 - optional
-    except ImportError as error:
-        raise ImportError(
-            f'progress_bar=True needs the package {error.name}: pip install "mbagent[progress]", or learn without the bar.'
-        ) from error
-
-
-@contextmanager
-def fit_progress(show: bool) -> Iterator[Callable[[float], None] | None]:
-    """A function to tell the share of a fit that is done, shown as a bar; None without ``show``, see ``check_progress``."""
-    if not show:
-        yield None
-        return
-    from tqdm.auto import tqdm  # noqa: PLC0415 - optional
-
-    with tqdm(total=100, desc="fitting the model", unit="%") as bar:
-
-        def tell(share: float) -> None:
-            bar.update(round(100 * share) - bar.n)
-
-        yield tell
-        bar.update(100 - bar.n)
-
-
-def log_fit(logger: Logger, report: FitReport, n_updates: int, n_transitions: int, n_start_states: int) -> None:
-    """Writes the ``train/`` and ``model/`` figures of a fit to the log.
-
-    Args:
-        logger: SB3's logger.
-        report: what the fit did.
-        n_updates: fits so far.
-        n_transitions: transitions met so far.
-        n_start_states: distinct start states known.
-    """
-    figures = {
-        "predictor_loss": report.predictor_loss,
-        "conditioner_loss": report.conditioner_loss,
-        "exact_match": report.exact_match,
-        "calibration": report.calibration,
-        "memory": report.memory,
-        "epochs": report.epochs,
-        "fit_seconds": report.seconds,
-    }
-    for name, value in figures.items():
-        if value is not None:
-            logger.record(f"train/{name}", value)
-    logger.record("train/n_updates", n_updates, exclude="tensorboard")
-    logger.record("model/transitions", n_transitions)
-    logger.record("model/start_states", n_start_states)
-    for name, value in report.log.items():
-        logger.record(f"model/{name}", value)
-
-
-def log_rollout(agent: BaseAlgorithm, began: float, steps_before: int) -> None:
-    """Writes the ``rollout/`` and ``time/`` figures to the agent's log.
-
-    Args:
-        agent: whose buffers of episodes are read.
-        began: when ``learn`` began, nanoseconds since the epoch.
-        steps_before: environment steps before that.
-    """
-    seconds, logger = max((time.time_ns() - began) / 1e9, 1e-9), agent.logger
-    if agent.ep_info_buffer:
-        logger.record("rollout/ep_rew_mean", safe_mean([info["r"] for info in agent.ep_info_buffer]))
-        logger.record("rollout/ep_len_mean", safe_mean([info["l"] for info in agent.ep_info_buffer]))
-    if agent.ep_success_buffer:
-        logger.record("rollout/success_rate", safe_mean(agent.ep_success_buffer))
-    logger.record("time/fps", int((agent.num_timesteps - steps_before) / seconds))
-    logger.record("time/time_elapsed", int(seconds), exclude="tensorboard")
-    logger.record("time/total_timesteps", agent.num_timesteps, exclude="tensorboard")
-
-
-@runtime_checkable
-class PrunableModel(Protocol):
-    """A transition model that has connections to remove; see ``NeuralTransitionModel.prune``."""
-
-    def prune(
-        self,
-        data: TransitionDataset,
-        fraction: float,
-        *,
-        seed: int = 0,
-        progress: Callable[[float], None] | None = None,
-        config: PruningConfig | None = None,
-    ) -> FitReport:
-        """Removes connections and trains what is left; leaves the model as it was where that fails."""
-        ...
-
-
-class PrunableAlgorithm(SavableAlgorithm):
-    """What ModelLearningAgent does to make its model smaller."""
-
-    def prune(self, fraction: float, *, progress_bar: bool = False, config: PruningConfig | None = None) -> Self:
-        """Removes the smallest weights of the model's networks, trains what is left on the transitions met, and plans on with it.
-
-        Each network loses this share of its connections, and those left over that the transitions do not call for; the goal
-        stays. Pruned again, the agent goes on from what is left. ``learn`` fits anew, with all connections.
-
-        Args:
-            fraction: least share of the connections that are gone afterwards, 0 or more and less than 1.
-            progress_bar: shows one.
-            config: how, see PruningConfig; ``PruningConfig(evidence=False)`` removes this share and no more.
-
-        Raises:
-            ValueError: a fraction out of range, nothing learned yet, or no transitions to train on (after ``load``).
-            TypeError: the model has no weights. The agent is as it was in each of these cases, as after any other error.
-        """
-        agent = cast("ModelLearningAgent", self)
-        fraction, model = check_fraction(fraction), prunable(agent.model)
-        if not agent.policy.fitted:
-            raise ValueError("There is nothing to prune yet: call learn() first.")
-        if not len(agent.experience.dataset):
-            raise ValueError(
-                "prune() trains what is left on the transitions met, and this agent has none: give it some with "
-                "load_transitions(path), or save agents with include=['transitions']."
-            )
-        with agent.policy.lock, fit_progress(progress_bar) as progress:
-            report = model.prune(agent.transitions, fraction, seed=agent._planning_seed, progress=progress, config=config)
-            agent._n_updates += 1
-            agent.fit_report = report
-            agent._refresh()
-        if hasattr(agent, "_logger"):  # a loaded agent has none before it learns
-            log_fit(agent.logger, report, agent._n_updates, len(agent.transitions), len(agent.policy.start_states))
-        return self
-
-
-def prunable(model: TransitionModel) -> PrunableModel:
-    """The model, if it can be pruned.
-
-    Raises:
-        TypeError: it has no weights; the message says what to do.
-    """
-    if isinstance(model, PrunableModel):
-        return model
-    raise TypeError(
-        f"This agent's model, {type(model).__name__}, has no connections to prune: decision graphs and tables hold only what the "
-        "data called for. Learn with model='networks' or model='paper' to prune networks."
-    )
-
+from mbagent.training_log import check_progress, fit_progress, log_fit, log_rollout
 
 ITERATION_STEPS = 1000
 """Environment steps between two looks at the logger."""
@@ -209,7 +58,7 @@ MAX_START_STATES = 512
 """Start states kept for generating the reachable machine."""
 
 
-class ModelLearningAgent(PrunableAlgorithm):
+class ModelLearningAgent(EnvironmentAlgorithm):
     """An SB3 algorithm that learns how the world works without reward, and plans on what it learned.
 
     ``learn`` explores, records transitions and fits a transition model (paper section 3). ``predict`` plans
@@ -254,6 +103,7 @@ class ModelLearningAgent(PrunableAlgorithm):
         "ValueIterationPolicy": ValueIterationPolicy,
     }
     policy: PlannerPolicy
+    _recorder: ExperienceRecorder | None = None
 
     def __init__(
         self,
@@ -290,22 +140,13 @@ class ModelLearningAgent(PrunableAlgorithm):
             support_multi_env=True,
             seed=seed,
         )
-        if not issubclass(self.policy_class, PlannerPolicy):
-            raise TypeError(f"policy must be a planner policy such as 'MctsPolicy', got {self.policy_class.__name__}.")
         self.model_name, self.exploration_name = check_model(model), check_exploration(exploration)
         self.gamma, self.num_simulations, self.time_budget, self.horizon = gamma, num_simulations, time_budget, horizon
         self._custom_reward, self.fit_report = reward, cast("FitReport | None", None)
         self._planning_seed = seed if seed is not None else int(np.random.SeedSequence().generate_state(1)[0] >> 1)
-        self._recorder: ExperienceRecorder | None = None
         self._rng = np.random.default_rng([self._planning_seed, EXPLORING])
         if _init_setup_model:
             self._setup_model()
-
-    # ------------------------------------------------------------------ parts
-
-    @staticmethod
-    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        return wrap_env(env, verbose, monitor_wrapper)
 
     @property
     def model(self) -> TransitionModel:
@@ -367,8 +208,6 @@ class ModelLearningAgent(PrunableAlgorithm):
         policy.recode(space, *self._build_models(space, policy.actions), starts, False)
         self.goals.recode()
 
-    # ------------------------------------------------------------------ goals
-
     def set_reward(self, reward: RewardFn | None) -> None:
         """Changes the goal; nothing is learned anew and no weight of the transition model changes.
 
@@ -407,8 +246,6 @@ class ModelLearningAgent(PrunableAlgorithm):
         self.policy.refresh()
         if self.policy.fitted:
             self.policy.set_goal(self.goals.current())
-
-    # ------------------------------------------------------------------ learn
 
     def learn(
         self,
@@ -539,6 +376,32 @@ class ModelLearningAgent(PrunableAlgorithm):
             self.logger.record("plan/first_seconds", time.perf_counter() - began)
             self.logger.record("plan/goal", self.goals.source)
 
+    def prune(self, fraction: float, *, progress_bar: bool = False, config: PruningConfig | None = None) -> Self:
+        """Removes the smallest weights of the model's networks, trains what is left on the transitions met, and plans on with it.
+
+        Each network loses this share of its connections, and those left over that the transitions do not call for; the goal
+        stays. Pruned again, the agent goes on from what is left. ``learn`` fits anew, with all connections.
+
+        Args:
+            fraction: least share of the connections that are gone afterwards, 0 or more and less than 1.
+            progress_bar: shows one.
+            config: how, see PruningConfig; ``PruningConfig(evidence=False)`` removes this share and no more.
+
+        Raises:
+            ValueError: a fraction out of range, nothing learned yet, or no transitions to train on (after ``load``).
+            TypeError: the model has no weights. The agent is as it was in each of these cases, as after any other error.
+        """
+        fraction = check_fraction(fraction)
+        model = prunable(self.model, self.policy.fitted, len(self.experience.dataset))
+        with self.policy.lock, fit_progress(progress_bar) as progress:
+            report = model.prune(self.transitions, fraction, seed=self._planning_seed, progress=progress, config=config)
+            self._n_updates += 1
+            self.fit_report = report
+            self._refresh()
+        if hasattr(self, "_logger"):  # a loaded agent has none before it learns
+            log_fit(self.logger, report, self._n_updates, len(self.transitions), len(self.policy.start_states))
+        return self
+
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Changes the environment (same spaces); without a custom reward the goal becomes the new environment's."""
         super().set_env(env, force_reset)
@@ -548,27 +411,190 @@ class ModelLearningAgent(PrunableAlgorithm):
             self.goals.take_environment(self.env)
             self._refresh()
 
-    def _setup_learn(
+    def state(self, transitions: bool = False) -> AgentState:
+        """Settings, weights, start states and the learned reward as plain data, see ``from_state``.
+
+        Args:
+            transitions: whether to include the transitions.
+
+        Raises:
+            ValueError: the model, the exploration or the policy is an object, which data cannot rebuild.
+        """
+        if not isinstance(self.model_name, str):
+            raise ValueError(
+                f"This agent's model is a {type(self.model).__name__} object, which a file without code cannot rebuild; "
+                "register a factory with mbagent.models.register_model(name, factory) and pass model=name."
+            )
+        if not isinstance(self.exploration_name, str):
+            raise ValueError("This agent's exploration is an object, which a file cannot rebuild; pass it by name.")
+        policy = self.policy
+        with policy.lock:
+            if policy.fitted:
+                self.goals.fit_learned()  # a loaded agent without an environment plans for it
+            arrays = {"policy": policy.arrays(), "planning": {"start_states": policy.start_states}}
+            if transitions:
+                rows = self.experience.dataset.rows()
+                arrays["transitions"] = {name: getattr(rows, name) for name in rows.__dataclass_fields__}
+            settings = {name: getattr(self, name) for name in SETTINGS if name != "stats_window_size"}
+            data = {
+                "policy_class": policy_name(self.policy_class, self.policy_aliases),
+                "observation_space": space_to_json(self.observation_space),
+                "action_space": space_to_json(self.action_space),
+                "settings": {**settings, "stats_window_size": self._stats_window_size},
+                "learning_rate": float(self.lr_schedule(1.0)),
+                "model": self.model_name,
+                "exploration": self.exploration_name,
+                "planning_seed": self._planning_seed,
+                "reward_source": self.goals.source,
+                "fitted": policy.fitted,
+                "reward_learned": self.goals.learned,
+                "num_timesteps": self.num_timesteps,
+                "n_envs": getattr(self, "n_envs", 1),
+                "n_updates": self._n_updates,
+            }
+        return AgentState(data, arrays)
+
+    @classmethod
+    def from_state(cls, state: AgentState, env: GymEnv | None = None, *, reward: RewardFn | None = None, **kwargs: Any) -> Self:
+        """The agent that a state was taken from.
+
+        Args:
+            state: see ``state``.
+            env: an environment with the same spaces, or None.
+            reward: the goal; needed again if it was a custom one.
+            **kwargs: constructor arguments that override those of the state.
+
+        Raises:
+            TypeError, ValueError: an unknown argument, other spaces, or weights that do not fit.
+        """
+        check_overrides(cls.__init__, kwargs)
+        data = state.data
+        arguments = {**data["settings"], "learning_rate": data["learning_rate"], "model": data["model"]}
+        arguments |= {"exploration": data["exploration"], **kwargs}
+        agent = cls(data["policy_class"], env=None, _init_setup_model=False, **arguments)
+        agent.observation_space, agent.action_space = (
+            space_from_json(data[f"{name}_space"]) for name in ("observation", "action")
+        )
+        if kwargs.get("seed") is None:
+            agent._planning_seed = int(data["planning_seed"])
+        agent.n_envs = int(data["n_envs"])
+        if env is not None:
+            wrapped = cls._wrap_env(env, agent.verbose)
+            check_for_correct_spaces(wrapped, agent.observation_space, agent.action_space)
+            agent.env, agent.n_envs = wrapped, wrapped.num_envs
+        agent._setup_model()
+        agent.num_timesteps, agent._n_updates = int(data["num_timesteps"]), int(data["n_updates"])
+        agent._restore(state, reward)
+        return agent
+
+    def _restore(self, state: AgentState, reward: RewardFn | None) -> None:
+        """Takes weights, start states, transitions and goal from a state."""
+        self._recode(self.policy.factored.from_value_arrays(state.arrays["policy"]))
+        policy, fitted = self.policy, bool(state.data["fitted"])
+        policy.start_states = state.start_states(np.asarray(policy.factored.cardinalities))
+        if (rows := state.transitions) is not None:
+            self.experience.dataset.append(rows)
+        if fitted:
+            policy.transition_model.load_state_dict(state.weights("model."))
+            policy.reward_model.load_state_dict(state.weights("reward."))
+            policy.fitted = True
+        self.goals.learned = bool(state.data["reward_learned"])
+        policy.refresh()
+        if reward is not None:
+            self.set_reward(reward)
+        elif fitted or state.data["reward_source"] == "custom":
+            policy.set_goal(self.goals.restore(state.data["reward_source"]))
+
+    def save(  # type: ignore[override]
+        self, path: Target, exclude: Sequence[str] | None = None, include: Sequence[str] | str | None = None
+    ) -> None:
+        """Writes settings, weights, start states and the learned reward to a zip that holds no code (see ``checkpoint``).
+
+        Args:
+            path: a path (".zip" is added where there is no suffix) or an open binary file.
+            exclude: accepted as in SB3; nothing here can be left out.
+            include: ``"transitions"``, or a list of it, adds the observed transitions.
+
+        Raises:
+            ValueError: the model or the exploration is an object that a file cannot rebuild, or ``include`` names anything else.
+            TypeError: ``path`` is neither a path nor an open binary file.
+            OSError: the file cannot be written; one that was there before is unchanged.
+        """
+        del exclude
+        names = [include] if isinstance(include, str) else include or ()
+        if unknown := [name for name in names if name != "transitions"]:
+            raise ValueError(f"include takes 'transitions' only, got {unknown[0]!r}; everything else is always saved.")
+        checkpoint.write(path, self.state(transitions="transitions" in names))
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls,
+        path: Target,
+        env: GymEnv | None = None,
+        device: torch.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        *,
+        reward: RewardFn | None = None,
+        **kwargs: Any,
+    ) -> Self:
+        """The agent that ``save`` wrote; no code in the file is ever run.
+
+        Args:
+            path: where it was written.
+            env: a new environment, with the same spaces.
+            device: torch device.
+            custom_objects: accepted as in SB3; files hold no objects that could be replaced.
+            print_system_info: accepted as in SB3.
+            force_reset: whether ``learn`` starts with a reset.
+            reward: the goal; needed again if it was a custom one.
+            **kwargs: constructor arguments that override the saved ones.
+
+        Raises:
+            FileNotFoundError, TypeError, ValueError: no such file, no path at all, or no saved agent.
+        """
+        del custom_objects
+        if print_system_info:
+            get_system_info()
+        agent = cls.from_state(checkpoint.read(path), env, reward=reward, device=device, **kwargs)
+        if force_reset:
+            agent._last_obs = None
+        return agent
+
+    def set_parameters(
         self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        """As SB3's; but for no steps at all an environment that has failed is left alone."""
-        assert self.env is not None
-        rest = tb_log_name, progress_bar
-        ended = has_ended(self.env)
-        if total_timesteps > 0 and ended:
-            raise RuntimeError(ENDED)
-        if total_timesteps > 0 or not (ended or (self._recorder is not None and self._last_obs is None)):
-            with naming_ended_processes(self.env):
-                return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *rest)
-        if reset_num_timesteps:
-            self.num_timesteps = self._episode_num = 0
-        self._last_obs = np.zeros(0)  # one must be there for SB3 not to reset the environment
-        try:
-            return super()._setup_learn(0, callback, False, *rest)
-        finally:
-            self._last_obs = None
+        load_path_or_dict: str | Mapping[str, Any],
+        exact_match: bool = True,
+        device: torch.device | str = "auto",
+    ) -> None:
+        """Takes weights from a saved agent or from ``get_parameters``; planning caches are dropped, the goal stays."""
+        params = load_path_or_dict
+        if not isinstance(params, Mapping):
+            params = {"policy": checkpoint.read(params).arrays["policy"]}
+        with self.policy.lock:
+            before = self.policy.parts()
+            try:
+                weights = params.get("policy", {})
+                self._recode(self.policy.factored.from_value_arrays({k: np.asarray(v) for k, v in dict(weights).items()}))
+                super().set_parameters(dict(params), exact_match, device)
+            except Exception:
+                if before[0] is not self.policy.factored:
+                    self.policy.recode(*before)
+                    self.goals.recode()
+                    self._refresh()
+                raise
+            self._refresh()
+
+    def save_transitions(self, path: Target) -> None:
+        """Writes what was experienced as an ``.npz`` of plain arrays (see TransitionDataset.save, also for what it raises)."""
+        self.experience.dataset.save(path)
+
+    def load_transitions(self, path: Target) -> None:
+        """Takes transitions from a file into this agent's experience; the next ``learn`` fits to them too.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: it holds no transitions, or those of another kind of environment; nothing is changed then.
+        """
+        self.experience.dataset.take(TransitionDataset.load(path))

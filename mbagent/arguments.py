@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
 
 from mbagent.exploration.strategies import EXPLORATIONS, Exploration
 from mbagent.models.protocol import TransitionModel
 from mbagent.planning.planner import PlannerSettings
+from mbagent.policies import PlannerPolicy
 from mbagent.spaces import FactoredSpace
 
 MAX_SEED = 2**32 - 1
@@ -95,7 +98,9 @@ def check_device(device: Any) -> torch.device | str:
 
 
 def check_policy(policy: Any, known: Iterable[str]) -> Any:
-    """The ``policy`` argument: a known name or a class."""
+    """The ``policy`` argument: a known name or a planner policy."""
+    if isinstance(policy, type) and not issubclass(policy, PlannerPolicy):
+        raise TypeError(f"policy must be a planner policy such as 'MctsPolicy', got {policy.__name__}.")
     if policy in known if isinstance(policy, str) else isinstance(policy, type):
         return policy
     raise ValueError(f"policy must be one of {sorted(known)}, or a subclass of PlannerPolicy, got {policy!r}.")
@@ -123,3 +128,29 @@ def check_exploration(exploration: Any) -> str | Exploration:
         raise TypeError(f"exploration must be a name or an object with act(states, rng), got {exploration!r}.")
     checked: str | Exploration = exploration
     return checked
+
+
+def check_overrides(constructor: Callable[..., Any], given: Mapping[str, Any]) -> None:
+    """Whether ``load`` and ``from_state`` take these arguments.
+
+    Raises:
+        TypeError: one is no argument of the constructor, or not one that can be overridden.
+    """
+    fixed = {"self", "policy", "env", "reward", "_init_setup_model"}
+    allowed = set(inspect.signature(constructor).parameters) - fixed
+    if unknown := sorted(set(given) - allowed):
+        raise TypeError(f"load() has no argument {unknown[0]!r}; it takes {', '.join(sorted(allowed))}.")
+
+
+def policy_name(policy_class: type[BasePolicy], aliases: Mapping[str, type[BasePolicy]]) -> str:
+    """The name that a policy has in a file.
+
+    Raises:
+        ValueError: it has none.
+    """
+    for name, known in aliases.items():
+        if known is policy_class:
+            return name
+    raise ValueError(
+        f"The policy {policy_class.__name__} has no name that a file could hold; add it to ModelLearningAgent.policy_aliases."
+    )

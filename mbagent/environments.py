@@ -14,10 +14,13 @@ from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, unwrap_vec_normalize
 from stable_baselines3.common.vec_env.patch_gym import _patch_env
 
@@ -242,3 +245,44 @@ def _if_picklable(name: str) -> str:
     except Exception:
         return ""
     return name
+
+
+class EnvironmentAlgorithm(BaseAlgorithm):
+    """SB3's base algorithm for environments whose steps or processes may fail, and for files without code."""
+
+    _recorder: Any = None
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        return wrap_env(env, verbose, monitor_wrapper)
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        """As SB3's; but for no steps at all an environment that has failed is left alone."""
+        assert self.env is not None
+        rest = tb_log_name, progress_bar
+        ended = has_ended(self.env)
+        if total_timesteps > 0 and ended:
+            raise RuntimeError(ENDED)
+        if total_timesteps > 0 or not (ended or (self._recorder is not None and self._last_obs is None)):
+            with naming_ended_processes(self.env):
+                return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *rest)
+        if reset_num_timesteps:
+            self.num_timesteps = self._episode_num = 0
+        self._last_obs = np.zeros(0)  # one must be there for SB3 not to reset the environment
+        try:
+            return super()._setup_learn(0, callback, False, *rest)
+        finally:
+            self._last_obs = None
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "policy", "transitions", "goals"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy"], []

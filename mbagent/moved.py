@@ -14,8 +14,10 @@ from typing import Any
 _PACKAGE = "mbagent."
 
 _FORMERLY = {
-    "agent": "pruned reporting",
-    "checkpoint": "persistence saving",
+    "agent": "pruned",
+    "checkpoint agent": "saving",
+    "checkpoint": "persistence",
+    "training_log": "reporting",
     "data": "experience transitions",
     "environments": "subprocesses wrapping",
     "explain": "explanations",

@@ -50,13 +50,16 @@ def dataset(n: int) -> TransitionDataset:
 
 
 def written_agent(path: Path, n: int) -> None:
-    checkpoint.write(path, {"n": n}, {"policy": {"weights": np.full(n, n)}})
+    data = dict.fromkeys(checkpoint.REQUIRED, 0) | {"settings": {}, "reward_source": "learned", "n_updates": n}
+    starts = {"start_states": np.zeros((1, 2))}
+    checkpoint.write(path, checkpoint.AgentState(data, {"policy": {"weights": np.full(n, n)}, "planning": starts}))
 
 
 def agent_rows(path: Path) -> int:
-    data, arrays = checkpoint.read(path)
-    assert arrays["policy"]["weights"].tolist() == [data["n"]] * data["n"]
-    return int(data["n"])
+    state = checkpoint.read(path)
+    n = int(state.data["n_updates"])
+    assert state.arrays["policy"]["weights"].tolist() == [n] * n
+    return n
 
 
 def table_rows(path: Path) -> int:

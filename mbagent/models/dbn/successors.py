@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from mbagent.models.dbn import expander as expander  # registers its overloads
 from mbagent.models.dbn.affected_variables import Lean, ends_late_only, lean
 from mbagent.models.dbn.arrays import Graphs, distributions, n_columns, show, show_next, show_next_meetings, write
 from mbagent.models.dbn.features import Layout

@@ -7,10 +7,16 @@ prune", whose schedule this is). A weight that is gone is exactly 0 and stays so
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
+
+from mbagent.data import TransitionDataset
+from mbagent.models.fit_report import FitReport
+from mbagent.models.protocol import TransitionModel
 
 
 def check_fraction(fraction: float) -> float:
@@ -129,3 +135,47 @@ def _possible(module: nn.Module, name: str, weight: nn.Parameter) -> Tensor:
     owner = module.get_submodule(name.rpartition(".")[0])
     mask = getattr(owner, "mask", None)
     return torch.ones_like(weight, dtype=torch.bool) if mask is None else mask.clone()
+
+
+@runtime_checkable
+class PrunableModel(Protocol):
+    """A transition model that has connections to remove; see ``NeuralTransitionModel.prune``."""
+
+    def prune(
+        self,
+        data: TransitionDataset,
+        fraction: float,
+        *,
+        seed: int = 0,
+        progress: Callable[[float], None] | None = None,
+        config: PruningConfig | None = None,
+    ) -> FitReport:
+        """Removes connections and trains what is left; leaves the model as it was where that fails."""
+        ...
+
+
+def prunable(model: TransitionModel, fitted: bool, n_transitions: int) -> PrunableModel:
+    """The model, if it can be pruned now.
+
+    Args:
+        model: any.
+        fitted: whether it is.
+        n_transitions: transitions to train the remaining connections on.
+
+    Raises:
+        TypeError: it has no weights; the message says what to do.
+        ValueError: nothing is learned yet, or there are no transitions.
+    """
+    if not isinstance(model, PrunableModel):
+        raise TypeError(
+            f"This agent's model, {type(model).__name__}, has no connections to prune: decision graphs and tables hold only what "
+            "the data called for. Learn with model='networks' or model='paper' to prune networks."
+        )
+    if not fitted:
+        raise ValueError("There is nothing to prune yet: call learn() first.")
+    if not n_transitions:
+        raise ValueError(
+            "prune() trains what is left on the transitions met, and this agent has none: give it some with "
+            "load_transitions(path), or save agents with include=['transitions']."
+        )
+    return model

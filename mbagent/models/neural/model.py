@@ -11,7 +11,6 @@ import torch
 
 from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.models.base import FitReport
-from mbagent.models.neural import bit_kernels as bit_kernels  # registers its overloads
 from mbagent.models.neural.bit_kernels import CausalBits, pack_bits
 from mbagent.models.neural.connections import PruningConfig, check_fraction
 from mbagent.models.neural.export import CompiledBody, as_rows, compiled_body, pack_dense, pack_groups

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from torch import nn
 
 from mbagent.models.base import BaseTransitionModel
-from mbagent.models.neural import bit_kernels as bit_kernels  # registers its overloads
 from mbagent.models.neural.connections import Connections
 from mbagent.models.neural.export import pack_layout
 from mbagent.models.neural.networks import Activation, Conditioner, DensePredictor, FactorCodec, Mask
