@@ -11,6 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "environments.md"
+PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted((ROOT / "docs").glob("*.md"))
 
 
 def blocks(page: Path = PAGE) -> list[str]:
@@ -65,3 +66,27 @@ def test_continuous_variables_are_cut_into_bins() -> None:
 def test_every_name_exists(link: str) -> None:
     module, _, name = link.rpartition(".")
     assert hasattr(pytest.importorskip(f"mbagent.{module}"), name)
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that GitHub gives to the headings of a page."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_relative_link_resolves(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)]+)\)", page.read_text(encoding="utf-8")):
+        if "://" not in target:
+            path, _, anchor = target.partition("#")
+            linked = page.parent / path if path else page
+            assert linked.exists(), target
+            assert not anchor or anchor in anchors(linked), target
+
+
+def test_the_glossary_is_in_order_and_names_a_source_for_every_term() -> None:
+    text = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+    rows = [line.strip("|").split(" | ") for line in text.splitlines() if line.startswith("| ")][2:]
+    terms = ["".join(c for c in row[0].strip().lower() if c.isalnum() or c == " ") for row in rows]
+    assert terms == sorted(set(terms))
+    assert all(len(row) == 3 and all(cell.strip() for cell in row) for row in rows)
