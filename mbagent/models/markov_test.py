@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mbagent.data import TransitionBatch
-from mbagent.models.dbn.features import Acts, shown_acts
+from mbagent.models.dbn.features import ActionEncoding, action_feature_table
 from mbagent.spaces import FactoredSpace, PlaneLayout
 
 PART = 2000
@@ -42,7 +42,11 @@ def steps_in_a_row(rows: TransitionBatch, most: int) -> tuple[TransitionBatch, T
 
 
 def with_past(
-    now: TransitionBatch, before: TransitionBatch, cardinalities: tuple[int, ...], acts: Acts, board: PlaneLayout | None
+    now: TransitionBatch,
+    before: TransitionBatch,
+    cardinalities: tuple[int, ...],
+    encoding: ActionEncoding,
+    board: PlaneLayout | None,
 ) -> tuple[FactoredSpace, TransitionBatch]:
     """Transitions that follow others, with the others' states and actions as part of their state.
 
@@ -50,7 +54,7 @@ def with_past(
         now: the transitions.
         before: those that they follow.
         cardinalities: number of values of each factor.
-        acts: the actions.
+        encoding: the actions.
         board: where the factors are cells of planes; the past is further planes then.
 
     Returns:
@@ -62,12 +66,12 @@ def with_past(
         return states if board is None else board.to_planes(states)
 
     def shown(states: NDArray[np.int64], past: NDArray[np.int64], actions: NDArray[np.int64]) -> NDArray[np.int64]:
-        bits = shown_acts(acts, actions).astype(np.int64)
+        bits = action_feature_table(encoding, actions).astype(np.int64)
         bits = bits if board is None else np.broadcast_to(bits[:, :, None, None], (*bits.shape, *shape[1:]))
         return np.concatenate([laid_out(states), laid_out(past), bits], axis=1)
 
     cards = laid_out(np.asarray(cardinalities)[None])[0]
-    twos = np.full((acts.n_columns, *shape[1:]), 2)
+    twos = np.full((encoding.n_features, *shape[1:]), 2)
     sizes = np.concatenate([cards, cards, twos])
     space = FactoredSpace(spaces.MultiBinary(sizes.shape) if (sizes == 2).all() else spaces.MultiDiscrete(sizes))
     states = space.encode(shown(now.states, before.states, before.actions))

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import Module, functional
 
 from mbagent.data import TransitionBatch
-from mbagent.models.dbn.reward_graphs import ClassGraphs, cells_in, check_graphs, class_chances, learn_classes
+from mbagent.models.dbn.reward_graphs import SAVED_CLASSES, ClassGraphs, cells_in, check_graphs, class_chances, fit_classes
 from mbagent.models.neural.export import pack_layout
 from mbagent.models.neural.kernels import RELU, Floats32, Layout, activate, active_columns, add_products, add_rows
 from mbagent.models.neural.networks import Affine, Convolution, FactorCodec, cells_of
@@ -305,7 +305,7 @@ class LearnedReward:
         number = np.searchsorted(self._values, rows.rewards)
         common = int(np.bincount(number, minlength=len(self._values)).argmax())
         order = np.concatenate([[common], np.delete(np.arange(len(self._values)), common)])
-        return learn_classes(rows, np.argsort(order)[number], self._codec.cardinalities, self._parts, self._planes), order
+        return fit_classes(rows, np.argsort(order)[number], self._codec.cardinalities, self._parts, self._planes), order
 
     def _chances(self, train: TransitionBatch, rows: TransitionBatch) -> Floats:
         """Probability [N, K] of each reward, as graphs learned from some rows tell them of others."""
@@ -427,7 +427,7 @@ class LearnedReward:
         """All weights, as arrays."""
         known = {"values": self._values.copy(), "classes": np.array(self._classes), "floor": np.array(self._floor)}
         if self._graphs is not None:
-            graphs = {f"graphs.{name}": array.copy() for name, array in self._graphs._asdict().items()}
+            graphs = {f"graphs.{name}": array.copy() for name, array in zip(SAVED_CLASSES, self._graphs, strict=True)}
             return {**known, "order": self._order.copy(), **graphs}
         return known | {f"network.{name}": value.numpy().copy() for name, value in self._network.state_dict().items()}
 

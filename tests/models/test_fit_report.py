@@ -5,7 +5,7 @@ import pytest
 from gymnasium import spaces
 
 from mbagent.models.dbn import DecisionGraphModel, LocalGraphModel
-from mbagent.models.dbn.features import acts_of
+from mbagent.models.dbn.features import action_encoding
 from mbagent.models.fit_report import calibration_error
 from mbagent.models.markov_test import following_steps, steps_in_a_row, with_past
 from mbagent.spaces import FactoredSpace
@@ -74,7 +74,7 @@ def test_only_steps_that_follow_another_have_a_past() -> None:
     assert (later - earlier == 1).all()
     mixed = rows.select(np.arange(40).reshape(2, 20).T.ravel())  # two episodes side by side, as vector environments play them
     assert all((later - earlier == 2).all() for later, earlier in (following_steps(mixed),))
-    space, longer = with_past(*steps_in_a_row(rows, 100), (6,), acts_of((3,)), None)
+    space, longer = with_past(*steps_in_a_row(rows, 100), (6,), action_encoding((3,)), None)
     assert space.cardinalities == (6, 6, 2, 2, 2)
     np.testing.assert_array_equal(longer.states[:, 1], now[earlier])
     np.testing.assert_array_equal(longer.next_states[:, 1], now[later])

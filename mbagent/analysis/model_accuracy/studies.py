@@ -26,7 +26,7 @@ from mbagent.analysis.model_accuracy.experiment import CASES, LEARNING_RATE, cer
 from mbagent.analysis.model_accuracy.minatar import minatar, variants
 from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.models.dbn import DecisionGraphModel, LocalGraphModel
-from mbagent.models.dbn.model import asked_columns, parent_factors
+from mbagent.models.dbn.model import parent_factors, tested_features
 from mbagent.models.model_error import estimate_error, likeliest, missed
 from mbagent.models.protocol import TransitionModel
 from mbagent.models.registry import build_model
@@ -155,7 +155,7 @@ def parents(seed: int, full: bool) -> list[Row]:
         units = [layout.members[a:b] for a, b in itertools.pairwise(layout.first[:-2])]
         true, found = true_parents(game, units, seed), np.zeros((len(units), len(units)), dtype=np.bool_)
         for v in range(len(units)):
-            asked = parent_factors(layout, asked_columns(model.fitted.usual, v))
+            asked = parent_factors(layout, tested_features(model.fitted.usual, v))
             found[v] = [bool(asked & set(members.tolist())) for members in units]
         np.fill_diagonal(found, False)
         hits = int((found & true).sum())

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.dbn.arrays import Graphs, distributions, meets, n_columns, show, with_rest, without_noise
-from mbagent.models.dbn.features import Acts, Layout
+from mbagent.models.dbn.arrays import Graphs, are_adjacent, distributions, n_features, show, with_rest, without_noise
+from mbagent.models.dbn.features import ActionEncoding, Layout
 from mbagent.models.dbn.sampling import only_possible
 from mbagent.models.systematic_sampling import NEGLIGIBLE
 from mbagent.types import Bools, Floats, Ints, Words
@@ -23,111 +23,113 @@ from mbagent_envs.jit import compiled, inlined
 MOST_WORDS = 4_000_000
 """Words of a table for each action; where they would be more, one table serves all actions."""
 
-FIRST, MEMBERS, OUTPUTS, START, PAIR, COUPLING = range(6)
-"""Columns of ``Lean.units``."""
+FIRST, MEMBERS, OUTPUTS, START, PAIR, MUTEX = range(6)
+"""Columns of ``AffectedIndex.variables``."""
 
 
-class Lean(NamedTuple):
+class AffectedIndex(NamedTuple):
     """Graphs as few arrays, and what each value of each factor touches.
 
     Attributes:
-        units: where its factors begin, how many there are, number of values, where its distribution and its pairs begin, and
+        variables: where its factors begin, how many there are, number of values, where its distribution and its pairs begin, and
             its coupling or -1, int64 [U, 6].
         members: factors of the units, int64.
         entries: where the entries of each pair begin, int64 [pairs + 1]; see ``compiled.Graphs``.
         entry: value and first node, int64 [E, 2].
         node: column, and the next node where it is off and on, int32 [nodes, 3].
         leaf: rate and spread, [nodes, 2].
-        habit: of each pair, how often it stays and how probable novelties are, [pairs, 2].
+        smoothing: of each pair, how often it stays and how probable novelties are, [pairs, 2].
         base: where novelties are drawn from, [sum of cardinalities].
         still: probability that a unit without graphs changes, [1].
         noise: see ``compiled.Graphs``.
         exactly: of the couplings, bool [Q].
         row: where each factor's values begin among the rows, int64 [F + 1].
         shown: where each factor's columns begin, int64 [F + 1].
-        columns: the lowest and highest value for which each is on, int64 [D, 2].
-        cells, meetings, counts, met, weights: see ``units.Layout``.
+        features: the lowest and highest value for which each is on, int64 [D, 2].
+        cells, adjacencies, counts, met, weights: see ``features.Layout``.
         touched: units that a factor's value touches, as bits, uint64 [A or 1, R, W].
-        by_meeting: the same of meetings, uint64 [A or 1, M, W].
+        by_adjacency: the same of meetings, uint64 [A or 1, M, W].
         always: units that do something even where everything is 0, uint64 [A, W].
         usual_on: columns that are on where everything is 0 and no action is taken, bool [D].
-        acts, factor, next_meetings: see ``units.Layout``.
+        encoding, factor, next_adjacencies: see ``features.Layout``.
         end_first, end_node, end_rate: graph of the end where it is drawn late, else empty, see ``ending.end_graph``.
     """
 
-    units: Ints
+    variables: Ints
     members: Ints
     entries: Ints
     entry: Ints
     node: NDArray[np.int32]
     leaf: Floats
-    habit: Floats
+    smoothing: Floats
     base: Floats
     still: Floats
     noise: Floats
     exactly: Bools
     row: Ints
     shown: Ints
-    columns: Ints
+    features: Ints
     cells: Ints
-    meetings: Ints
+    adjacencies: Ints
     counts: Ints
     met: Bools
     weights: Ints
     touched: Words
-    by_meeting: Words
+    by_adjacency: Words
     always: Words
     usual_on: Bools
-    acts: Acts
+    encoding: ActionEncoding
     factor: Ints
-    next_meetings: Ints
+    next_adjacencies: Ints
     end_first: Ints
     end_node: NDArray[np.int32]
     end_rate: Floats
 
 
-def lean(layout: Layout, graphs: Graphs, late: Graphs, cardinalities: tuple[int, ...]) -> Lean:
+def affected_index(layout: Layout, graphs: Graphs, synchronic: Graphs, cardinalities: tuple[int, ...]) -> AffectedIndex:
     """The arrays of some graphs.
 
     Args:
         layout: the units.
         graphs: of all of them, for planning.
-        late: of none, or of the end alone.
+        synchronic: of none, or of the end alone.
         cardinalities: number of values of each factor, length F.
     """
     row = np.concatenate([[0], np.cumsum(cardinalities)]).astype(np.int64)
     shown = np.searchsorted(layout.factor, np.arange(layout.n_factors + 1)).astype(np.int64)
-    always, touched, by_meeting, on = _tables(layout, graphs, row)
+    always, touched, by_adjacency, on = _tables(layout, graphs, row)
     sizes = np.diff(layout.first)
-    units = np.stack([layout.first[:-1], sizes, layout.outputs, graphs.start[:-1], graphs.pairs[:-1], layout.coupling_of], axis=1)
-    end_first, end_node, end_rate = end_graph(layout, late)
-    return Lean(
-        units=np.ascontiguousarray(units, dtype=np.int64),
+    variables = np.stack(
+        [layout.first[:-1], sizes, layout.outputs, graphs.start[:-1], graphs.pairs[:-1], layout.mutex_of], axis=1
+    )
+    end_first, end_node, end_rate = end_graph(layout, synchronic)
+    return AffectedIndex(
+        variables=np.ascontiguousarray(variables, dtype=np.int64),
         members=layout.members,
         entries=graphs.entries,
         entry=np.stack([graphs.values, graphs.nodes], axis=1),
-        node=np.stack([graphs.column, graphs.off, graphs.on], axis=1).astype(np.int32),
+        node=np.stack([graphs.feature, graphs.off, graphs.on], axis=1).astype(np.int32),
         leaf=np.stack([graphs.rate, graphs.spread], axis=1),
-        habit=np.stack([graphs.stays, graphs.novelty], axis=1),
+        smoothing=np.stack([graphs.persistence, graphs.unseen_mass], axis=1),
         base=graphs.base,
         still=graphs.still,
         noise=graphs.noise,
         exactly=layout.exactly,
         row=row,
         shown=shown,
-        columns=np.stack([layout.value, layout.top], axis=1),
+        features=np.stack([layout.value, layout.top], axis=1),
         cells=layout.cells,
-        meetings=layout.meetings,
+        adjacencies=layout.adjacencies,
         counts=layout.counts,
         met=layout.met,
         weights=layout.weights,
         touched=touched,
-        by_meeting=by_meeting,
+        by_adjacency=by_adjacency,
         always=always,
         usual_on=on,
-        acts=layout.acts,
+        encoding=layout.encoding,
         factor=layout.factor,
-        next_meetings=layout.next_meetings,
+        next_adjacencies=layout.next_adjacencies,
         end_first=end_first,
         end_node=end_node,
         end_rate=end_rate,
@@ -135,24 +137,24 @@ def lean(layout: Layout, graphs: Graphs, late: Graphs, cardinalities: tuple[int,
 
 
 def _tables(layout: Layout, graphs: Graphs, row: Ints) -> tuple[Words, Words, Words, Bools]:
-    """``always``, ``touched``, ``by_meeting`` and ``usual_on`` of Lean."""
-    n_words, n_rows, n_actions = -(-len(layout.outputs) // 64), int(row[-1]), len(layout.acts.way)
+    """``always``, ``touched``, ``by_adjacency`` and ``usual_on`` of Lean."""
+    n_words, n_rows, n_actions = -(-len(layout.outputs) // 64), int(row[-1]), len(layout.encoding.action_class)
     n_tables = n_actions if n_actions * n_rows * n_words <= MOST_WORDS else 1
     touched = np.zeros((n_tables, n_rows, n_words), dtype=np.uint64)
-    by_meeting = np.zeros((n_tables, len(layout.meetings), n_words), dtype=np.uint64)
-    nothing, on = np.zeros(layout.n_factors, dtype=np.int64), np.zeros(n_columns(layout), dtype=np.bool_)
+    by_adjacency = np.zeros((n_tables, len(layout.adjacencies), n_words), dtype=np.uint64)
+    nothing, on = np.zeros(layout.n_factors, dtype=np.int64), np.zeros(n_features(layout), dtype=np.bool_)
     always = np.zeros((n_actions, n_words), dtype=np.uint64)
     _usual(layout, graphs, nothing, on, always)
-    _dependents(layout, graphs, row, nothing, on, touched, by_meeting)
+    _dependents(layout, graphs, row, nothing, on, touched, by_adjacency)
     show(nothing, 0, layout, on)
-    on[len(layout.factor) : len(layout.factor) + layout.acts.n_columns] = False
-    return always, touched, by_meeting, on
+    on[len(layout.factor) : len(layout.factor) + layout.encoding.n_features] = False
+    return always, touched, by_adjacency, on
 
 
 @compiled
-def set_bit(words: Words, unit: int) -> None:
+def set_bit(words: Words, variable: int) -> None:
     """Adds a unit to a set [W]."""
-    words[unit >> 6] |= np.uint64(1) << np.uint64(unit & 63)
+    words[variable >> 6] |= np.uint64(1) << np.uint64(variable & 63)
 
 
 @compiled
@@ -160,61 +162,61 @@ def _usual(layout: Layout, graphs: Graphs, nothing: Ints, on: Bools, always: Wor
     """Fills ``always``; see Lean."""
     values, rates = np.zeros(len(layout.outputs), dtype=np.int64), np.zeros(graphs.start[-1], dtype=np.float64)
     everything = np.arange(len(layout.outputs))
-    for action in range(len(layout.acts.way)):
+    for action in range(len(layout.encoding.action_class)):
         show(nothing, action, layout, on)
         distributions(everything, nothing, action, layout, graphs, on, values, rates)
-        for unit in graphs.changing:
-            start = graphs.start[unit]
-            if layout.coupling_of[unit] >= 0:
+        for variable in graphs.changing:
+            start = graphs.start[variable]
+            if layout.mutex_of[variable] >= 0:
                 active = rates[start + 1] > 0.0
             else:
-                active = only_possible(rates, start, layout.outputs[unit]) != 0
+                active = only_possible(rates, start, layout.outputs[variable]) != 0
             if active:
-                set_bit(always[action], unit)
+                set_bit(always[action], variable)
 
 
 @compiled
-def _dependents(layout: Layout, graphs: Graphs, row: Ints, nothing: Ints, on: Bools, touched: Words, by_meeting: Words) -> None:
+def _dependents(layout: Layout, graphs: Graphs, row: Ints, nothing: Ints, on: Bools, touched: Words, by_adjacency: Words) -> None:
     """Fills the last two arguments; see Lean.
 
     Where everything is 0, a unit's graphs are followed to their usual leaves; as long as the columns asked on these ways are as
     usual, nothing else can be found. So only these touch the unit.
     """
-    first_action, first_meeting = len(layout.factor), len(layout.factor) + layout.acts.n_columns
-    for unit in range(len(layout.outputs) - 2):
-        if layout.coupling_of[unit] >= 0 or (graphs.changing == unit).any():
-            for factor in layout.members[layout.first[unit] : layout.first[unit + 1]]:
+    first_action, first_adjacency = len(layout.factor), len(layout.factor) + layout.encoding.n_features
+    for variable in range(len(layout.outputs) - 2):
+        if layout.mutex_of[variable] >= 0 or (graphs.changing == variable).any():
+            for factor in layout.members[layout.first[variable] : layout.first[variable + 1]]:
                 for r in range(row[factor] + 1, row[factor + 1]):
                     for table in range(len(touched)):
-                        set_bit(touched[table, r], unit)
-    for action in range(len(layout.acts.way)):
+                        set_bit(touched[table, r], variable)
+    for action in range(len(layout.encoding.action_class)):
         table = action if len(touched) > 1 else 0
         show(nothing, action, layout, on)
-        for unit in graphs.changing:
-            pair = graphs.pairs[unit] + layout.acts.way[action] * layout.outputs[unit]
+        for variable in graphs.changing:
+            pair = graphs.pairs[variable] + layout.encoding.action_class[action] * layout.outputs[variable]
             for entry in range(graphs.entries[pair], graphs.entries[pair + 1]):
                 node = graphs.nodes[entry]
-                while graphs.column[node] >= 0:
-                    column = graphs.column[node]
-                    if column >= first_meeting:
-                        set_bit(by_meeting[table, column - first_meeting], unit)
-                    elif column < first_action:
-                        _touch(column, unit, layout, row, touched[table])
-                    node = graphs.on[node] if on[column] else graphs.off[node]
+                while graphs.feature[node] >= 0:
+                    feature = graphs.feature[node]
+                    if feature >= first_adjacency:
+                        set_bit(by_adjacency[table, feature - first_adjacency], variable)
+                    elif feature < first_action:
+                        _touch(feature, variable, layout, row, touched[table])
+                    node = graphs.on[node] if on[feature] else graphs.off[node]
 
 
 @compiled
-def _touch(column: int, unit: int, layout: Layout, row: Ints, touched: Words) -> None:
+def _touch(feature: int, variable: int, layout: Layout, row: Ints, touched: Words) -> None:
     """Adds a unit to what those values of a column's factor touch that show the column otherwise than 0 does."""
-    factor, usual = layout.factor[column], layout.value[column] <= 0 <= layout.top[column]
+    factor, usual = layout.factor[feature], layout.value[feature] <= 0 <= layout.top[feature]
     for r in range(row[factor] + 1, row[factor + 1]):
         value = r - row[factor]
-        if (layout.value[column] <= value <= layout.top[column]) != usual:
-            set_bit(touched[r], unit)
+        if (layout.value[feature] <= value <= layout.top[feature]) != usual:
+            set_bit(touched[r], variable)
 
 
 @inlined
-def show_state(state: Ints, shown: Ints, columns: Ints, different: Ints, on: Bools) -> int:
+def show_state(state: Ints, shown: Ints, features: Ints, different: Ints, on: Bools) -> int:
     """Writes factors that are not 0 to ``different`` and shows their columns; returns how many."""
     n = 0
     for factor in range(len(state)):
@@ -222,55 +224,55 @@ def show_state(state: Ints, shown: Ints, columns: Ints, different: Ints, on: Boo
         if value != 0:
             different[n] = factor
             n += 1
-            for column in range(shown[factor], shown[factor + 1]):
-                on[column] = columns[column, 0] <= value <= columns[column, 1]
+            for feature in range(shown[factor], shown[factor + 1]):
+                on[feature] = features[feature, 0] <= value <= features[feature, 1]
     return n
 
 
 @inlined
-def touched_units(
+def affected_variables_of(
     action: int,
     state: Ints,
     different: Ints,
     row: Ints,
     touched: Words,
-    by_meeting: Words,
+    by_adjacency: Words,
     always: Words,
-    first_meeting: int,
+    first_adjacency: int,
     on: Bools,
     usual: Bools,
     words: Words,
-    units: Ints,
+    variables: Ints,
 ) -> int:
-    """Writes the units that do anything unusual to ``units``, ascending; returns how many there are."""
+    """Writes the units that do anything unusual to ``variables``, ascending; returns how many there are."""
     table, n_words, n = action if len(touched) > 1 else 0, len(words), 0
     for j in range(n_words):
         words[j] = always[action, j]
     for factor in different:
         for j in range(n_words):
             words[j] |= touched[table, row[factor] + state[factor], j]
-    for m in range(by_meeting.shape[1]):
-        if on[first_meeting + m] != usual[first_meeting + m]:
+    for m in range(by_adjacency.shape[1]):
+        if on[first_adjacency + m] != usual[first_adjacency + m]:
             for j in range(n_words):
-                words[j] |= by_meeting[table, m, j]
+                words[j] |= by_adjacency[table, m, j]
     for j in range(n_words):
-        word, unit = words[j], j << 6
+        word, variable = words[j], j << 6
         while word:
             while not word & np.uint64(0xFF):
                 word >>= np.uint64(8)
-                unit += 8
+                variable += 8
             if word & np.uint64(1):
-                units[n] = unit
+                variables[n] = variable
                 n += 1
             word >>= np.uint64(1)
-            unit += 1
+            variable += 1
     return n
 
 
 @inlined
-def value_of(unit: int, state: Ints, units: Ints, members: Ints) -> int:
+def value_of(variable: int, state: Ints, variables: Ints, members: Ints) -> int:
     """A unit's present value."""
-    first, n = units[unit, FIRST], units[unit, MEMBERS]
+    first, n = variables[variable, FIRST], variables[variable, MEMBERS]
     if n == 1:
         return int(state[members[first]])
     for member in range(n):
@@ -283,15 +285,15 @@ def value_of(unit: int, state: Ints, units: Ints, members: Ints) -> int:
 def rates_of(
     touched: Ints,
     state: Ints,
-    way: int,
+    action_class: int,
     on: Bools,
-    units: Ints,
+    variables: Ints,
     members: Ints,
     entries: Ints,
     entry: Ints,
     nodes: NDArray[np.int32],
     leaf: Floats,
-    habit: Floats,
+    smoothing: Floats,
     base: Floats,
     still: Floats,
     noise: float,
@@ -300,10 +302,10 @@ def rates_of(
 ) -> None:
     """As ``compiled.distributions``, of the touched units; writes their present values to ``values``, in their order."""
     for i in range(len(touched)):
-        unit = touched[i]
-        n, start, value = units[unit, OUTPUTS], units[unit, START], value_of(unit, state, units, members)
+        variable = touched[i]
+        n, start, value = variables[variable, OUTPUTS], variables[variable, START], value_of(variable, state, variables, members)
         values[i] = value
-        pair = units[unit, PAIR] + way * n + value
+        pair = variables[variable, PAIR] + action_class * n + value
         begins, ends = entries[pair], entries[pair + 1]
         total, slack, asked = 0.0, 0.0, False
         for k in range(start, start + n):
@@ -322,28 +324,32 @@ def rates_of(
             rate = out[start + 1] if ends > begins else usual if value == 0 else 1.0 - usual
             out[start], out[start + 1] = 1.0 - rate, rate
             continue
-        with_rest(out, base, start, n, value, total, slack, habit[pair, 0], habit[pair, 1], ends > begins, asked, noise)
+        with_rest(out, base, start, n, value, total, slack, smoothing[pair, 0], smoothing[pair, 1], ends > begins, asked, noise)
 
 
-def ends_late_only(layout: Layout, late: Graphs) -> bool:
+def only_end_is_synchronic(layout: Layout, synchronic: Graphs) -> bool:
     """Whether nothing is drawn late but the end."""
-    return bool((late.changing == len(layout.outputs) - 2).all())
+    return bool((synchronic.changing == len(layout.outputs) - 2).all())
 
 
-def end_graph(layout: Layout, late: Graphs) -> tuple[Ints, NDArray[np.int32], Floats]:
+def end_graph(layout: Layout, synchronic: Graphs) -> tuple[Ints, NDArray[np.int32], Floats]:
     """The graph of the end: first node of each way, -1 where it never came, [W]; nodes (column, off, on) and their rates.
 
     Nothing where the end is not drawn late.
     """
-    if len(late.changing) == 0:
+    if len(synchronic.changing) == 0:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3), dtype=np.int32), np.zeros(0)
-    first = np.full(layout.acts.n_ways, -1, dtype=np.int64)
-    for way in range(layout.acts.n_ways):
-        pair = late.pairs[len(layout.outputs) - 2] + 2 * way
-        if late.entries[pair + 1] > late.entries[pair]:
-            first[way] = late.nodes[late.entries[pair]]
-    rates = [without_noise(rate, spread, 2, NEGLIGIBLE) for rate, spread in zip(late.rate, late.spread, strict=True)]
-    return first, np.stack([late.column, late.off, late.on], axis=1).astype(np.int32), np.asarray(rates, dtype=np.float64)
+    first = np.full(layout.encoding.n_action_classes, -1, dtype=np.int64)
+    for action_class in range(layout.encoding.n_action_classes):
+        pair = synchronic.pairs[len(layout.outputs) - 2] + 2 * action_class
+        if synchronic.entries[pair + 1] > synchronic.entries[pair]:
+            first[action_class] = synchronic.nodes[synchronic.entries[pair]]
+    rates = [without_noise(rate, spread, 2, NEGLIGIBLE) for rate, spread in zip(synchronic.rate, synchronic.spread, strict=True)]
+    return (
+        first,
+        np.stack([synchronic.feature, synchronic.off, synchronic.on], axis=1).astype(np.int32),
+        np.asarray(rates, dtype=np.float64),
+    )
 
 
 @inlined
@@ -355,21 +361,21 @@ def end_rate(
     following: Ints,
     on: Bools,
     factor: Ints,
-    columns: Ints,
+    features: Ints,
     cells: Ints,
-    next_meetings: Ints,
+    next_adjacencies: Ints,
 ) -> float:
     """Probability that the episode ends with this next state [F]; ``on`` are the columns of the state before, [D]."""
     if node < 0:
         return otherwise
     while nodes[node, 0] >= 0:
-        column = nodes[node, 0]
-        if column < len(on):
-            asked = on[column]
-        elif column < len(on) + len(factor):
-            c = column - len(on)
-            asked = columns[c, 0] <= following[factor[c]] <= columns[c, 1]
+        feature = nodes[node, 0]
+        if feature < len(on):
+            asked = on[feature]
+        elif feature < len(on) + len(factor):
+            c = feature - len(on)
+            asked = features[c, 0] <= following[factor[c]] <= features[c, 1]
         else:
-            asked = meets(following, cells, next_meetings[column - len(on) - len(factor)])
+            asked = are_adjacent(following, cells, next_adjacencies[feature - len(on) - len(factor)])
         node = nodes[node, 2] if asked else nodes[node, 1]
     return float(rate[node])

@@ -13,7 +13,7 @@ import numpy as np
 from mbagent.models.dbn.effects import chained
 from mbagent.models.dbn.features import BEYOND, Layout, Question
 from mbagent.models.dbn.leaf_prior import LeafPrior, fitted_prior
-from mbagent.models.dbn.smoothing import Habit
+from mbagent.models.dbn.smoothing import Smoothing
 from mbagent.models.dbn.splits import Search
 from mbagent.types import Bools, Floats, Ints
 from mbagent_envs.jit import compiled, inlined
@@ -24,17 +24,17 @@ class Graphs(NamedTuple):
 
     Attributes:
         changing: units that have graphs, int64.
-        pairs: where the pairs (way, value) of each unit begin, int64 [U + 1]; pair ``way * cardinality + value``, with the
-            action's way, see ``acts.Acts``.
+        pairs: where the pairs (way, value) of each unit begin, int64 [U + 1]; pair ``action_class * cardinality + value``, with the
+            action's way, see ``encoding.ActionEncoding``.
         entries: where the entries of each pair begin, int64 [pairs + 1].
         values: the value that an entry is about, int64 [E].
         nodes: its first node, int64 [E].
-        column: what a node asks for, -1 at a leaf, int64 [nodes].
+        feature: what a node asks for, -1 at a leaf, int64 [nodes].
         off, on: next node, int64 [nodes].
         rate: probability at a leaf, [nodes].
         spread: standard error of a leaf's rate, 0 where all its rows agree, [nodes].
-        stays: share of a pair's rows in which the unit kept its value, [pairs]; 1 where there are none.
-        novelty: probability that what follows a pair is none of what was seen to follow it, [pairs].
+        persistence: share of a pair's rows in which the unit kept its value, [pairs]; 1 where there are none.
+        unseen_mass: probability that what follows a pair is none of what was seen to follow it, [pairs].
         base: where the novelties of each unit are drawn from, after ``start`` [U + 1], [sum of cardinalities].
         still: probability that a unit without graphs changes, [1].
         noise: 0, or for planning: values no observation stands behind count as impossible where they are less probable than
@@ -46,13 +46,13 @@ class Graphs(NamedTuple):
     entries: Ints
     values: Ints
     nodes: Ints
-    column: Ints
+    feature: Ints
     off: Ints
     on: Ints
     rate: Floats
     spread: Floats
-    stays: Floats
-    novelty: Floats
+    persistence: Floats
+    unseen_mass: Floats
     start: Ints
     base: Floats
     still: Floats
@@ -66,21 +66,21 @@ class Nodes:
         self.links: list[tuple[int, int, int]] = []
         self.rates: list[tuple[float, float]] = []
 
-    def add(self, column: int, off: int, on: int, rate: float = 0.0, spread: float = 0.0) -> int:
+    def add(self, feature: int, off: int, on: int, rate: float = 0.0, spread: float = 0.0) -> int:
         """Adds a node; returns its number."""
-        self.links.append((column, off, on))
+        self.links.append((feature, off, on))
         self.rates.append((rate, spread))
         return len(self.links) - 1
 
     def graph(self, search: Search, prior: LeafPrior) -> Ints:
         """Adds a head's graph; returns the first node of each of its first contexts."""
         n, e = search.counts()
-        rates = prior.rates(n, e, search.typical)
+        rates = prior.rates(n, e, search.prior_mean)
         spreads = np.sqrt(e * (n - e) / np.maximum(n, 1) ** 3)
         level = [self.add(-1, 0, 0, float(rate), float(spread)) for rate, spread in zip(rates, spreads, strict=True)]
         for split in reversed(search.splits):
             level = [
-                level[off] if level[off] == level[on] else self.add(split.column, level[off], level[on])
+                level[off] if level[off] == level[on] else self.add(split.feature, level[off], level[on])
                 for off, on in zip(split.off, split.on, strict=True)
             ]
         return np.asarray(level, dtype=np.int64)
@@ -95,61 +95,65 @@ def linked(
     parts = np.asarray(links, dtype=np.int64).reshape(-1, 3)
     begins = np.searchsorted(table[:, 0], np.arange(n_pairs + 1)).astype(np.int64)
     value, node = np.ascontiguousarray(table[:, 1:].T)
-    column, off, on = np.ascontiguousarray(parts.T)
-    return begins, value, node, column, off, on
+    feature, off, on = np.ascontiguousarray(parts.T)
+    return begins, value, node, feature, off, on
 
 
-def build(layout: Layout, asked: Sequence[Question], found: Sequence[Search], habits: Sequence[Habit], still: float) -> Graphs:
+def build(
+    layout: Layout, asked: Sequence[Question], found: Sequence[Search], smoothings: Sequence[Smoothing], still: float
+) -> Graphs:
     """All graphs.
 
     Args:
         layout: the units.
         asked: the questions.
         found: what was found for each.
-        habits: of each unit.
+        smoothings: of each unit.
         still: probability that a unit without graphs changes.
     """
     nodes, prior = Nodes(), fitted_prior(found)
-    pairs = np.concatenate([[0], np.cumsum(layout.acts.n_ways * layout.outputs)]).astype(np.int64)
+    pairs = np.concatenate([[0], np.cumsum(layout.encoding.n_action_classes * layout.outputs)]).astype(np.int64)
     entries = [np.zeros((0, 3), dtype=np.int64)]
-    partnered: dict[int, list[tuple[Question, Ints]]] = {}
+    with_operand: dict[int, list[tuple[Question, Ints]]] = {}
     for question, search in zip(asked, found, strict=True):
         first = nodes.graph(search, prior)[question.context]
-        if question.partner is not None:
-            partnered.setdefault(question.unit, []).append((question, first))
+        if question.operand is not None:
+            with_operand.setdefault(question.variable, []).append((question, first))
         else:
-            entries.append(np.stack([pairs[question.unit] + question.pairs, question.values, first], axis=1))
-    for unit, answered in partnered.items():
-        entries += _by_partner(nodes, answered, pairs[unit], int(layout.outputs[unit]), layout.acts.n_ways)
+            entries.append(np.stack([pairs[question.variable] + question.pairs, question.values, first], axis=1))
+    for variable, answered in with_operand.items():
+        entries += _by_operand(nodes, answered, pairs[variable], int(layout.outputs[variable]), layout.encoding.n_action_classes)
     rates = np.asarray(nodes.rates, dtype=np.float64).reshape(-1, 2)
     return Graphs(
-        np.asarray(sorted({question.unit for question in asked}), dtype=np.int64),
+        np.asarray(sorted({question.variable for question in asked}), dtype=np.int64),
         pairs,
         *linked(np.concatenate(entries), int(pairs[-1]), nodes.links),
         np.ascontiguousarray(rates[:, 0]),
         np.ascontiguousarray(rates[:, 1]),
-        np.concatenate([habit.stays for habit in habits]),
-        np.concatenate([habit.novelty for habit in habits]),
+        np.concatenate([smoothing.persistence for smoothing in smoothings]),
+        np.concatenate([smoothing.unseen_mass for smoothing in smoothings]),
         np.concatenate([[0], np.cumsum(layout.outputs)]).astype(np.int64),
-        np.concatenate([habit.base for habit in habits]),
+        np.concatenate([smoothing.base for smoothing in smoothings]),
         np.asarray([still]),
         np.zeros(1),
     )
 
 
-def _by_partner(nodes: Nodes, answered: Sequence[tuple[Question, Ints]], begin: int, cardinality: int, n_ways: int) -> list[Ints]:
+def _by_operand(
+    nodes: Nodes, answered: Sequence[tuple[Question, Ints]], begin: int, cardinality: int, n_action_classes: int
+) -> list[Ints]:
     """Entries (pair, value, node) [N, 3] of a unit that has a partner: what the action is, nodes ask for if at all."""
     rows = [np.stack([*np.divmod(q.pairs, cardinality), q.values, first], axis=1) for q, first in answered]
-    columns = answered[0][0].partner
-    assert columns is not None
-    now, value, node = chained(np.concatenate(rows), columns, nodes.add, nodes.add(-1, 0, 0)).T
-    return [np.stack([begin + way * cardinality + now, value, node], axis=1) for way in range(n_ways)]
+    features = answered[0][0].operand
+    assert features is not None
+    now, value, node = chained(np.concatenate(rows), features, nodes.add, nodes.add(-1, 0, 0)).T
+    return [np.stack([begin + action_class * cardinality + now, value, node], axis=1) for action_class in range(n_action_classes)]
 
 
 @compiled
-def read(state: Ints, unit: int, layout: Layout) -> int:
+def read(state: Ints, variable: int, layout: Layout) -> int:
     """Value of a unit in a state [F]; 0 for ``terminated`` and the event."""
-    first, last = layout.first[unit], layout.first[unit + 1]
+    first, last = layout.first[variable], layout.first[variable + 1]
     if last - first == 1:
         return int(state[layout.members[first]])
     for member in range(first, last):
@@ -159,9 +163,9 @@ def read(state: Ints, unit: int, layout: Layout) -> int:
 
 
 @compiled
-def write(state: Ints, unit: int, value: int, layout: Layout) -> None:
+def write(state: Ints, variable: int, value: int, layout: Layout) -> None:
     """Sets a unit's value in a state [F]."""
-    first, last = layout.first[unit], layout.first[unit + 1]
+    first, last = layout.first[variable], layout.first[variable + 1]
     if last - first == 1:
         state[layout.members[first]] = value
     elif last > first:
@@ -173,57 +177,57 @@ def write(state: Ints, unit: int, value: int, layout: Layout) -> None:
 def show(state: Ints, action: int, layout: Layout, on: Bools) -> None:
     """Writes which columns are on to ``on`` [D]."""
     n = len(layout.factor)
-    for column in range(n):
-        value = state[layout.factor[column]]
-        on[column] = layout.value[column] <= value <= layout.top[column]
-    acts = layout.acts
-    on[n : n + acts.n_columns] = False
-    for i in range(acts.first[action], acts.first[action + 1]):
-        on[n + acts.column[i]] = True
-    n += acts.n_columns
-    for m in range(len(layout.meetings)):
-        on[n + m] = meets(state, layout.cells, layout.meetings[m])
+    for feature in range(n):
+        value = state[layout.factor[feature]]
+        on[feature] = layout.value[feature] <= value <= layout.top[feature]
+    encoding = layout.encoding
+    on[n : n + encoding.n_features] = False
+    for i in range(encoding.first[action], encoding.first[action + 1]):
+        on[n + encoding.feature[i]] = True
+    n += encoding.n_features
+    for m in range(len(layout.adjacencies)):
+        on[n + m] = are_adjacent(state, layout.cells, layout.adjacencies[m])
 
 
 @compiled
-def meets(state: Ints, cells: Ints, meeting: Ints) -> bool:
-    """Whether a meeting (see ``units.Layout``) takes place in a state [F]."""
+def are_adjacent(state: Ints, cells: Ints, adjacency: Ints) -> bool:
+    """Whether a meeting (see ``features.Layout``) takes place in a state [F]."""
     _, height, width = cells.shape
-    below, right = meeting[4], meeting[5]
+    below, right = adjacency[4], adjacency[5]
     for y in range(height):
         for x in range(width):
-            if state[cells[meeting[0], y, x]] == meeting[1]:
-                row, column = y + below, x + right
-                inside = 0 <= row < height and 0 <= column < width
-                if meeting[2] == BEYOND:
+            if state[cells[adjacency[0], y, x]] == adjacency[1]:
+                row, col = y + below, x + right
+                inside = 0 <= row < height and 0 <= col < width
+                if adjacency[2] == BEYOND:
                     if not inside:
                         return True
-                elif inside and state[cells[meeting[2], row, column]] == meeting[3]:
+                elif inside and state[cells[adjacency[2], row, col]] == adjacency[3]:
                     return True
     return False
 
 
 @compiled
-def n_columns(layout: Layout) -> int:
+def n_features(layout: Layout) -> int:
     """Number of columns D."""
-    return len(layout.factor) + layout.acts.n_columns + len(layout.meetings)
+    return len(layout.factor) + layout.encoding.n_features + len(layout.adjacencies)
 
 
 @compiled
 def show_next(following: Ints, layout: Layout, on: Bools) -> None:
     """Writes which columns a next state [F] has on, after those of the state in ``on``."""
-    n = n_columns(layout)
-    for column in range(len(layout.factor)):
-        value = following[layout.factor[column]]
-        on[n + column] = layout.value[column] <= value <= layout.top[column]
+    n = n_features(layout)
+    for feature in range(len(layout.factor)):
+        value = following[layout.factor[feature]]
+        on[n + feature] = layout.value[feature] <= value <= layout.top[feature]
 
 
 @compiled
-def show_next_meetings(following: Ints, layout: Layout, on: Bools) -> None:
+def show_next_adjacencies(following: Ints, layout: Layout, on: Bools) -> None:
     """Writes what meets what in a next state [F], after all other columns."""
-    n = n_columns(layout) + len(layout.factor)
-    for m in range(len(layout.next_meetings)):
-        on[n + m] = meets(following, layout.cells, layout.next_meetings[m])
+    n = n_features(layout) + len(layout.factor)
+    for m in range(len(layout.next_adjacencies)):
+        on[n + m] = are_adjacent(following, layout.cells, layout.next_adjacencies[m])
 
 
 @inlined
@@ -250,8 +254,8 @@ def with_rest(
     value: int,
     total: float,
     slack: float,
-    stays: float,
-    novelty: float,
+    persistence: float,
+    unseen_mass: float,
     known: bool,
     asked: bool,
     noise: float,
@@ -263,15 +267,15 @@ def with_rest(
     for anything (``asked``), so that rows in which it stayed may have been others, and it is much less than in all rows.
     """
     stay = 1.0 - total
-    observed = not known or (stays > 0.0 and (stay > slack or not asked or stay >= 0.5 * stays))
+    observed = not known or (persistence > 0.0 and (stay > slack or not asked or stay >= 0.5 * persistence))
     if known:
-        stay = max(0.0, stay - slack) if stays == 0.0 else max(stay, min(slack, stays))
+        stay = max(0.0, stay - slack) if persistence == 0.0 else max(stay, min(slack, persistence))
     out[start + value] = stay if observed or noise == 0.0 else -stay
-    scale, top, left = (1.0 - novelty) / (total + stay), 0.0, 0.0
+    scale, top, left = (1.0 - unseen_mass) / (total + stay), 0.0, 0.0
     for k in range(start, start + n):
-        top = max(top, abs(out[k]) * scale + novelty * base[k])
+        top = max(top, abs(out[k]) * scale + unseen_mass * base[k])
     for k in range(start, start + n):
-        chance = abs(out[k]) * scale + novelty * base[k]
+        chance = abs(out[k]) * scale + unseen_mass * base[k]
         out[k] = chance if out[k] > 0.0 or chance >= noise * top else 0.0
         left += out[k]
     for k in range(start, start + n if noise > 0.0 else start):
@@ -280,31 +284,31 @@ def with_rest(
 
 @compiled
 def distributions(
-    units: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs, on: Bools, values: Ints, out: Floats
+    variables: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs, on: Bools, values: Ints, out: Floats
 ) -> None:
-    """Writes value and next distribution of some units to ``values`` [U] and, from ``start[unit]`` on, to ``out``.
+    """Writes value and next distribution of some units to ``values`` [U] and, from ``start[variable]`` on, to ``out``.
 
     All units are done in one call: handing the graphs over costs more than a unit does.
     """
-    for unit in units:
-        first, n, start = layout.first[unit], layout.outputs[unit], graphs.start[unit]
-        value = state[layout.members[first]] if layout.first[unit + 1] == first + 1 else 0
-        if layout.first[unit + 1] > first + 1:
-            for member in range(first, layout.first[unit + 1]):
+    for variable in variables:
+        first, n, start = layout.first[variable], layout.outputs[variable], graphs.start[variable]
+        value = state[layout.members[first]] if layout.first[variable + 1] == first + 1 else 0
+        if layout.first[variable + 1] > first + 1:
+            for member in range(first, layout.first[variable + 1]):
                 if state[layout.members[member]] == 1:
                     value = member - first
                     break
-        values[unit] = value
+        values[variable] = value
         noise = graphs.noise[0]
-        pair = graphs.pairs[unit] + layout.acts.way[action] * n + value
+        pair = graphs.pairs[variable] + layout.encoding.action_class[action] * n + value
         total, slack, asked = 0.0, 0.0, False
         for k in range(start, start + n):
             out[k] = 0.0
         for entry in range(graphs.entries[pair], graphs.entries[pair + 1]):
             node = graphs.nodes[entry]
-            asked |= graphs.column[node] >= 0
-            while graphs.column[node] >= 0:
-                node = graphs.on[node] if on[graphs.column[node]] else graphs.off[node]
+            asked |= graphs.feature[node] >= 0
+            while graphs.feature[node] >= 0:
+                node = graphs.on[node] if on[graphs.feature[node]] else graphs.off[node]
             rate = without_noise(graphs.rate[node], graphs.spread[node], n, noise)
             out[start + graphs.values[entry]] = rate
             total += abs(rate)
@@ -315,4 +319,17 @@ def distributions(
             rate = out[start + 1] if known else still if value == 0 else 1.0 - still
             out[start], out[start + 1] = 1.0 - rate, rate
             continue
-        with_rest(out, graphs.base, start, n, value, total, slack, graphs.stays[pair], graphs.novelty[pair], known, asked, noise)
+        with_rest(
+            out,
+            graphs.base,
+            start,
+            n,
+            value,
+            total,
+            slack,
+            graphs.persistence[pair],
+            graphs.unseen_mass[pair],
+            known,
+            asked,
+            noise,
+        )

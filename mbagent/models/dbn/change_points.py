@@ -17,8 +17,8 @@ from mbagent.data import TransitionBatch
 from mbagent.models.held_out import thinned
 from mbagent.types import Bools, Floats, Ints
 
-Foretell: TypeAlias = Callable[[TransitionBatch, TransitionBatch], Floats]
-"""``foretell(train, tests) -> float [T, V]``: log-probability of each variable's outcome after learning from ``train``."""
+LogPredictive: TypeAlias = Callable[[TransitionBatch, TransitionBatch], Floats]
+"""``log_predictive(train, tests) -> float [T, V]``: log-probability of each variable's outcome after learning from ``train``."""
 
 LENGTHS = (50, 100, 200, 400, 800)
 """Runs of so many newest steps are looked at, the shorter ones only if they surprise more than others."""
@@ -29,7 +29,7 @@ LONG = 400
 UNUSUAL = 0.1
 """Share of earlier runs that may surprise as much as one that is looked at."""
 
-MOST_LOOKS = 2
+MOST_PATTERNS = 2
 """So many runs are held against all of the past; the second one for variables that did not change with the others."""
 
 FEWEST_RUNS = 6
@@ -48,35 +48,37 @@ SURE = 10.0
 """Nats by which a run must surprise more than any early one, and be foretold better; plus the log of the number of variables."""
 
 
-def still_true_since(rows: TransitionBatch, n_variables: int, foretell: Foretell) -> Ints:
+def last_changes(rows: TransitionBatch, n_variables: int, log_predictive: LogPredictive) -> Ints:
     """First row that tells of each variable as it is now, int64 [V]; 0 where nothing changed.
 
     Args:
         rows: transitions in the order met.
         n_variables: number of variables V.
-        foretell: learns from some transitions and foretells others.
+        log_predictive: learns from some transitions and foretells others.
     """
     n, since = len(rows), np.zeros(n_variables, dtype=np.int64)
     lengths = [length for length in LENGTHS if FEWEST_RUNS * length <= n]
     if not lengths:
         return since
-    limit, known, runs = SURE + math.log(n_variables), _logs(thinned(rows, MOST_ROWS), rows, foretell), []
+    limit, known, runs = SURE + math.log(n_variables), _logs(thinned(rows, MOST_ROWS), rows, log_predictive), []
     for length in lengths:
         surprise = _surprise(known, length)
         suspect = surprise > 0.0
         if surprise[suspect].sum() > limit or length >= LONG:
-            anew = _crossed(rows, np.arange(n - length, n), foretell)
+            anew = _crossed(rows, np.arange(n - length, n), log_predictive)
             gain = anew - known[-length:]
             runs.append(_Run(length, anew, suspect, np.where(_gaining(suspect, gain, limit), gain.sum(axis=0), 0.0)))
-    for _ in range(MOST_LOOKS):
+    for _ in range(MOST_PATTERNS):
         run = max(runs, key=lambda run: float(run.total[since == 0].sum()), default=None)
         if run is None or run.total[since == 0].sum() == 0.0:
             break
         runs, newest, past = [other for other in runs if other is not run], np.arange(n - run.length, n), n - run.length
-        gain = run.anew - _crossed(rows, newest, foretell, np.arange(past))  # all of the past foretells more than some of it
+        gain = run.anew - _crossed(
+            rows, newest, log_predictive, np.arange(past)
+        )  # all of the past foretells more than some of it
         found = _gaining(run.suspect, gain, limit) & (since == 0)
         if found.any():
-            before = _logs(rows.select(newest), rows.select(np.arange(past)), foretell) - known[:past]
+            before = _logs(rows.select(newest), rows.select(np.arange(past)), log_predictive) - known[:past]
             since[found] = _turns(np.concatenate([before, gain])[:, found], limit)
     return since
 
@@ -97,8 +99,8 @@ class _Run(NamedTuple):
     total: Floats
 
 
-def _logs(train: TransitionBatch, tests: TransitionBatch, foretell: Foretell) -> Floats:
-    return np.maximum(foretell(train, tests), -DEAREST)
+def _logs(train: TransitionBatch, tests: TransitionBatch, log_predictive: LogPredictive) -> Floats:
+    return np.maximum(log_predictive(train, tests), -DEAREST)
 
 
 def _surprise(logs: Floats, length: int) -> Floats:
@@ -116,13 +118,13 @@ def _gaining(suspect: Bools, gain: Floats, limit: float) -> Bools:
     return result
 
 
-def _crossed(rows: TransitionBatch, newest: Ints, foretell: Foretell, old: Ints | None = None) -> Floats:
+def _crossed(rows: TransitionBatch, newest: Ints, log_predictive: LogPredictive, old: Ints | None = None) -> Floats:
     """Each part of the newest rows foretold from their other parts, and from old rows if given."""
     logs = []
     for part in np.array_split(newest, PARTS):
         others = np.setdiff1d(newest, part)
         known = others if old is None else np.concatenate([old, others])
-        logs.append(_logs(rows.select(known), rows.select(part), foretell))
+        logs.append(_logs(rows.select(known), rows.select(part), log_predictive))
     return np.concatenate(logs)
 
 

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mbagent.data import TransitionBatch
-from mbagent.models.dbn.features import Layout, Question, Seen, act_columns, ask, question
-from mbagent.models.dbn.smoothing import Habit, Pools, habit_of
+from mbagent.models.dbn.features import Layout, Observed, Question, action_features, ask, question
+from mbagent.models.dbn.smoothing import Pools, Smoothing, smoothing_of
 from mbagent.models.held_out import FORETOLD, better, thinned
 from mbagent.types import Bools, Floats, Ints
 
@@ -34,21 +34,21 @@ MOST_ENTRIES = 50_000
 
 
 @dataclass(frozen=True)
-class Partner:
+class Operand:
     """A factor, the action, or a part of it.
 
     Attributes:
         cardinality: number of its values.
         factor: number of the factor, or -1.
         stride: of the action's part: it is ``action // stride % cardinality``.
-        column: number of the part's first column among those of actions.
+        feature: number of the part's first column among those of actions.
         whole: whether it is the action, which is one thing.
     """
 
     cardinality: int
     factor: int = -1
     stride: int = 1
-    column: int = 0
+    feature: int = 0
     whole: bool = False
 
     def of(self, rows: TransitionBatch) -> Ints:
@@ -56,22 +56,22 @@ class Partner:
         found = rows.before[:, self.factor] if self.factor >= 0 else rows.actions // self.stride % self.cardinality
         return np.asarray(found, dtype=np.int64)
 
-    def columns(self, layout: Layout) -> Ints:
+    def features(self, layout: Layout) -> Ints:
         """The column that is on where it has each value, int64 [cardinality]."""
         if self.factor >= 0:
             own = (layout.factor == self.factor) & (layout.value == layout.top)
             return np.flatnonzero(own)[np.argsort(layout.value[own])]
-        return len(layout.factor) + self.column + np.arange(self.cardinality)
+        return len(layout.factor) + self.feature + np.arange(self.cardinality)
 
 
-def candidates(cardinalities: Sequence[int], parts: Sequence[int]) -> list[Partner]:
+def candidates(cardinalities: Sequence[int], parts: Sequence[int]) -> list[Operand]:
     """All factors with an order, and all parts of the action that have one; what is on or off has none."""
-    factors = [Partner(n, factor=f) for f, n in enumerate(cardinalities) if n > 2]
-    columns = enumerate(act_columns(parts))
-    return factors + [Partner(n, -1, stride, i, len(parts) == 1) for i, (stride, n, value) in columns if n > 2 and value == 0]
+    factors = [Operand(n, factor=f) for f, n in enumerate(cardinalities) if n > 2]
+    features = enumerate(action_features(parts))
+    return factors + [Operand(n, -1, stride, i, len(parts) == 1) for i, (stride, n, value) in features if n > 2 and value == 0]
 
 
-def likely_partners(factors: Sequence[int], among: Sequence[Partner], rows: TransitionBatch) -> list[tuple[Partner, int] | None]:
+def likely_operands(factors: Sequence[int], among: Sequence[Operand], rows: TransitionBatch) -> list[tuple[Operand, int] | None]:
     """For each factor the partner that its change most surely rises (1) or falls (-1) with; None if with none.
 
     All other candidates are held constant: least squares, with t statistics.
@@ -84,7 +84,7 @@ def likely_partners(factors: Sequence[int], among: Sequence[Partner], rows: Tran
     some = thinned(rows, MOST_LOOKED_AT)
     if len(among) > MOST_CANDIDATES or len(some) < 2 * len(among) + 10:
         return [None] * len(factors)
-    x = np.stack([partner.of(some) for partner in among], axis=1).astype(np.float64)
+    x = np.stack([operand.of(some) for operand in among], axis=1).astype(np.float64)
     x -= x.mean(axis=0)
     change = some.after[:, factors].astype(np.float64) - some.before[:, factors]
     change -= change.mean(axis=0)
@@ -92,9 +92,9 @@ def likely_partners(factors: Sequence[int], among: Sequence[Partner], rows: Tran
     slopes = inverse @ (x.T @ change)
     left = ((change - x @ slopes) ** 2).sum(axis=0) / (len(some) - len(among) - 1)
     t = slopes / np.sqrt(np.outer(np.diag(inverse), left) + 1e-12)
-    found: list[tuple[Partner, int] | None] = []
+    found: list[tuple[Operand, int] | None] = []
     for i, factor in enumerate(factors):
-        own = [partner.factor == factor for partner in among]
+        own = [operand.factor == factor for operand in among]
         t[own, i] = 0.0
         best = int(np.abs(t[:, i]).argmax())
         likely = (among[best], int(np.sign(t[best, i]))) if abs(t[best, i]) > SURE else None
@@ -102,18 +102,18 @@ def likely_partners(factors: Sequence[int], among: Sequence[Partner], rows: Tran
     return found
 
 
-def _entries(partner: Partner, sign: int, factor: Partner, rows: TransitionBatch) -> int:
+def _entries(operand: Operand, sign: int, factor: Operand, rows: TransitionBatch) -> int:
     """Number of nodes that a factor's sum with its partner takes, at most; with the action none."""
-    far = rows.after[:, factor.factor].astype(np.int64) - factor.of(rows) - sign * partner.of(rows)
-    return factor.cardinality * partner.cardinality * (len(np.unique(far)) + 2) * (not partner.whole)
+    far = rows.after[:, factor.factor].astype(np.int64) - factor.of(rows) - sign * operand.of(rows)
+    return factor.cardinality * operand.cardinality * (len(np.unique(far)) + 2) * (not operand.whole)
 
 
-def chained(entries: Ints, columns: Ints, add: Callable[[int, int, int], int], zero: int) -> Ints:
+def chained(entries: Ints, features: Ints, add: Callable[[int, int, int], int], zero: int) -> Ints:
     """One node for each (present value, value) that leads on by the partner's value.
 
     Args:
         entries: (partner's value, present value, value, node), int64 [N, 4].
-        columns: the partner's.
+        features: the partner's.
         add: adds a node (column, off, on) and returns its number.
         zero: node for the partner's values of which there is no entry.
 
@@ -121,51 +121,54 @@ def chained(entries: Ints, columns: Ints, add: Callable[[int, int, int], int], z
         (present value, value, node) of each, int64 [M, 3].
     """
     found: dict[tuple[int, int], int] = {}
-    for partner, now, value, node in entries.tolist():
-        found[now, value] = add(int(columns[partner]), found.get((now, value), zero), node)
+    for operand, now, value, node in entries.tolist():
+        found[now, value] = add(int(features[operand]), found.get((now, value), zero), node)
     return np.asarray([(now, value, node) for (now, value), node in found.items()], dtype=np.int64).reshape(-1, 3)
 
 
-def for_all_ways(habit: Habit, n_partner: int, n_ways: int) -> Habit:
+def for_all_actions(smoothing: Smoothing, n_operand: int, n_action_classes: int) -> Smoothing:
     """A habit by pairs (partner's value, value), as one by pairs (way, value)."""
-    stays, novelty = (np.tile(array.reshape(n_partner, -1).max(axis=0), n_ways) for array in (habit.stays, habit.novelty))
-    return replace(habit, stays=stays, novelty=novelty)
+    persistence, unseen_mass = (
+        np.tile(array.reshape(n_operand, -1).max(axis=0), n_action_classes)
+        for array in (smoothing.persistence, smoothing.unseen_mass)
+    )
+    return replace(smoothing, persistence=persistence, unseen_mass=unseen_mass)
 
 
 SELDOM = 1e-9
 """Share of rows in which a value is kept that a sum may lead back to: whatever the other values leave."""
 
 
-class Manner(Enum):
+class Effect(Enum):
     """How a factor is asked about; a sum or a difference is that of its value and the action's number, or its partner's.
 
     What is beyond the bounds counts in some sums, and is lost before luck comes in others: those fill or drain.
     """
 
-    GOES = "goes"
-    MOVES = "moves"
-    ADDS = "adds"
-    TAKES = "takes"
-    FILLS = "fills"
-    DRAINS = "drains"
+    ABSOLUTE = "goes"
+    RELATIVE = "moves"
+    SUM = "adds"
+    DIFFERENCE = "takes"
+    CLIPPED_SUM = "fills"
+    CLIPPED_DIFFERENCE = "drains"
 
     def sum_of(self, values: Ints, actions: Ints, last: int) -> Ints:
         """The sum of present values and the actions' numbers, or their difference."""
-        sums = values + actions if self in (Manner.ADDS, Manner.FILLS) else values - actions
-        return np.clip(sums, 0, last) if self in (Manner.FILLS, Manner.DRAINS) else sums
+        sums = values + actions if self in (Effect.SUM, Effect.CLIPPED_SUM) else values - actions
+        return np.clip(sums, 0, last) if self in (Effect.CLIPPED_SUM, Effect.CLIPPED_DIFFERENCE) else sums
 
 
-class Asking(NamedTuple):
+class EffectModel(NamedTuple):
     """A manner, and what sums are with; None for the number of the action's way."""
 
-    manner: Manner
-    partner: Partner | None = None
+    effect: Effect
+    operand: Operand | None = None
 
 
-WHERE = Asking(Manner.GOES)
+ABSOLUTE_EFFECT = EffectModel(Effect.ABSOLUTE)
 """Where it goes."""
 
-SUMS = (Manner.ADDS, Manner.TAKES, Manner.FILLS, Manner.DRAINS)
+SUMS = (Effect.SUM, Effect.DIFFERENCE, Effect.CLIPPED_SUM, Effect.CLIPPED_DIFFERENCE)
 """Manners that ask of sums."""
 
 SUM_ERRORS = 1.0
@@ -175,30 +178,30 @@ ENOUGH, MOST_FOLDS = 1000, 6
 """So many held-out rows tell which manner fits; where there are fewer, others are held out, too, so many times in all."""
 
 
-def best_askings(
-    foretold: Callable[[Sequence[Asking]], Floats],
+def best_effect_models(
+    log_probs: Callable[[Sequence[EffectModel]], Floats],
     n_factors: int,
-    partners: Callable[[], Sequence[tuple[Partner, int] | None]],
-) -> list[Asking]:
+    operands: Callable[[], Sequence[tuple[Operand, int] | None]],
+) -> list[EffectModel]:
     """How each of K factors is foretold best; sums are looked at where something is left to foretell.
 
     Args:
-        foretold: log-probabilities of held-out next values, each factor being asked about in some way, [N, K].
+        log_probs: log-probabilities of held-out next values, each factor being asked about in some way, [N, K].
         n_factors: K.
-        partners: the likeliest of each factor, and whether it is added (1) or taken away (-1).
+        operands: the likeliest of each factor, and whether it is added (1) or taken away (-1).
     """
-    logs, moves = (foretold([asking] * n_factors) for asking in (WHERE, Asking(Manner.MOVES)))
+    logs, moves = (log_probs([effect_model] * n_factors) for effect_model in (ABSOLUTE_EFFECT, EffectModel(Effect.RELATIVE)))
     moving = (moves - logs).sum(axis=0) > 0.0
-    best, logs = [Asking(Manner.MOVES) if there else WHERE for there in moving], np.where(moving, moves, logs)
+    best, logs = [EffectModel(Effect.RELATIVE) if there else ABSOLUTE_EFFECT for there in moving], np.where(moving, moves, logs)
     random = np.flatnonzero(logs.mean(axis=0) < FORETOLD).tolist()
-    likely = partners() if random else []
+    likely = operands() if random else []
     if not any(likely[i] for i in random):
         return best
     rounds = [
-        [_summed(manners, *one) if one else usual for one, usual in zip(likely, best, strict=True)]
-        for manners in ((Manner.ADDS, Manner.TAKES), (Manner.FILLS, Manner.DRAINS))
+        [_summed(effects, *one) if one else usual for one, usual in zip(likely, best, strict=True)]
+        for effects in ((Effect.SUM, Effect.DIFFERENCE), (Effect.CLIPPED_SUM, Effect.CLIPPED_DIFFERENCE))
     ]
-    sums = np.stack([foretold(askings) for askings in rounds])
+    sums = np.stack([log_probs(effect_models) for effect_models in rounds])
     for i in random:
         most = int(sums[:, :, i].mean(axis=1).argmax())
         if better(sums[most, :, i], logs[:, i], SUM_ERRORS):
@@ -206,9 +209,9 @@ def best_askings(
     return best
 
 
-def _summed(manners: tuple[Manner, Manner], partner: Partner, sign: int) -> Asking:
+def _summed(effects: tuple[Effect, Effect], operand: Operand, sign: int) -> EffectModel:
     """How to ask about a sum with a partner, or a difference; actions are in all questions as it is."""
-    return Asking(manners[sign < 0], None if partner.whole else partner)
+    return EffectModel(effects[sign < 0], None if operand.whole else operand)
 
 
 def more_folds(train: TransitionBatch, held_out: TransitionBatch) -> list[Bools]:
@@ -219,53 +222,57 @@ def more_folds(train: TransitionBatch, held_out: TransitionBatch) -> list[Bools]
     return [np.arange(len(train)) // n == fold for fold in range(folds)]
 
 
-def ask_in(manner: Manner, unit: int, cardinality: int, n_actions: int, seen: Seen) -> list[Question]:
+def questions_for_effect(effect: Effect, variable: int, cardinality: int, n_actions: int, observed: Observed) -> list[Question]:
     """The questions about one unit; none if it never changes.
 
     Args:
-        manner: how to ask; units of two values are asked where they go.
-        unit: its number.
+        effect: how to ask; units of two values are asked where they go.
+        variable: its number.
         cardinality: number of its values.
         n_actions: number of ways of actions, met or not.
-        seen: the rows to ask.
+        observed: the rows to ask.
     """
-    if manner is Manner.GOES or cardinality == 2 or (seen.now == seen.then).all():
-        return ask(unit, cardinality, seen)
-    return _sums(manner, unit, cardinality, n_actions, seen) if manner in SUMS else _moves(unit, cardinality, seen)
+    if effect is Effect.ABSOLUTE or cardinality == 2 or (observed.now == observed.then).all():
+        return ask(variable, cardinality, observed)
+    return (
+        _sums(effect, variable, cardinality, n_actions, observed) if effect in SUMS else _moves(variable, cardinality, observed)
+    )
 
 
-def _moves(unit: int, cardinality: int, seen: Seen) -> list[Question]:
+def _moves(variable: int, cardinality: int, observed: Observed) -> list[Question]:
     """How far a unit moves under the actions that ever moved it so far, whatever its present value, met or not.
 
     After the last value comes the first.
     """
-    far, asked = (seen.then - seen.now) % cardinality, []
+    far, asked = (observed.then - observed.now) % cardinality, []
     for move in np.unique(far[far > 0]):
-        leading = np.unique(seen.actions[far == move])
-        rows = np.flatnonzero(np.isin(seen.actions, leading))
+        leading = np.unique(observed.actions[far == move])
+        rows = np.flatnonzero(np.isin(observed.actions, leading))
         every = (leading[:, None] * cardinality + np.arange(cardinality)).ravel()
-        one = question(unit, far[rows], int(move), cardinality, seen.select(rows), every)
+        one = question(variable, far[rows], int(move), cardinality, observed.select(rows), every)
         asked.append(replace(one, values=(every % cardinality + move) % cardinality))
     return asked
 
 
-def _sums(manner: Manner, unit: int, cardinality: int, n_actions: int, seen: Seen) -> list[Question]:
+def _sums(effect: Effect, variable: int, cardinality: int, n_actions: int, observed: Observed) -> list[Question]:
     """How far from the sum a unit ends within its bounds, and for either bound whether it ends there, given the sum.
 
     Sums that were never met are taken for the nearest one that was.
     """
     last, every = cardinality - 1, np.arange(n_actions * cardinality)
-    sums, here = (manner.sum_of(*of, last) for of in ((every % cardinality, every // cardinality), (seen.now, seen.actions)))
-    inside, asked = (seen.then > 0) & (seen.then < last), []
-    for far in np.unique((seen.then - here)[inside]):
+    sums, here = (
+        effect.sum_of(*of, last) for of in ((every % cardinality, every // cardinality), (observed.now, observed.actions))
+    )
+    inside, asked = (observed.then > 0) & (observed.then < last), []
+    for far in np.unique((observed.then - here)[inside]):
         rows = np.flatnonzero((here + far > 0) & (here + far < last))
         there = (sums + far > 0) & (sums + far < last)
-        one = question(unit, (seen.then - here)[rows], int(far), cardinality, seen.select(rows), every[there])
+        one = question(variable, (observed.then - here)[rows], int(far), cardinality, observed.select(rows), every[there])
         asked.append(_elsewhere(replace(one, values=sums[there] + far), cardinality))
     met = np.unique(here)
     nearest = np.searchsorted((met[:-1] + met[1:]) / 2, sums)
-    for bound in np.intersect1d((0, last), seen.then):
-        one = question(unit, seen.then, int(bound), cardinality, seen, every, nearest)
+    for bound in np.intersect1d((0, last), observed.then):
+        one = question(variable, observed.then, int(bound), cardinality, observed, every, nearest)
         asked.append(_elsewhere(one, cardinality))
     return asked
 
@@ -276,20 +283,20 @@ def _elsewhere(one: Question, cardinality: int) -> Question:
     return replace(one, values=one.values[other], pairs=one.pairs[other], context=one.context[other])
 
 
-def habit_in(manner: Manner, cardinality: int, n_actions: int, seen: Seen) -> Habit:
+def smoothing_for_effect(effect: Effect, cardinality: int, n_actions: int, observed: Observed) -> Smoothing:
     """A unit's habit where it is asked about in a manner: what the manner asks at once is counted at once, too."""
-    if manner is Manner.GOES or cardinality == 2 or len(seen.now) == 0:
-        return habit_of(cardinality, n_actions, seen.actions, seen.now, seen.then)
+    if effect is Effect.ABSOLUTE or cardinality == 2 or len(observed.now) == 0:
+        return smoothing_of(cardinality, n_actions, observed.actions, observed.now, observed.then)
     every = np.arange(n_actions * cardinality)
-    if manner is Manner.MOVES:
-        pools = Pools(every // cardinality, (seen.then - seen.now) % cardinality)
-        return habit_of(cardinality, n_actions, seen.actions, seen.now, seen.then, pools)
+    if effect is Effect.RELATIVE:
+        pools = Pools(every // cardinality, (observed.then - observed.now) % cardinality)
+        return smoothing_of(cardinality, n_actions, observed.actions, observed.now, observed.then, pools)
     value, last = every % cardinality, cardinality - 1
-    sums, here = manner.sum_of(value, every // cardinality, last), manner.sum_of(seen.now, seen.actions, last)
-    far, inside = seen.then - here, (seen.then > 0) & (seen.then < last)
-    pools = Pools(np.zeros_like(every), np.where(inside, far - far.min(), np.ptp(far) + 1 + seen.then))
-    habit = habit_of(cardinality, n_actions, seen.actions, seen.now, seen.then, pools)
+    sums, here = effect.sum_of(value, every // cardinality, last), effect.sum_of(observed.now, observed.actions, last)
+    far, inside = observed.then - here, (observed.then > 0) & (observed.then < last)
+    pools = Pools(np.zeros_like(every), np.where(inside, far - far.min(), np.ptp(far) + 1 + observed.then))
+    smoothing = smoothing_of(cardinality, n_actions, observed.actions, observed.now, observed.then, pools)
     met = np.isin(value - sums, far[inside]) & (value > 0) & (value < last)
     for bound in (0, last):
-        met |= (value == bound) & np.isin(sums, here[seen.then == bound])
-    return replace(habit, stays=np.where(met, SELDOM, 0.0))
+        met |= (value == bound) & np.isin(sums, here[observed.then == bound])
+    return replace(smoothing, persistence=np.where(met, SELDOM, 0.0))

@@ -13,19 +13,19 @@ from typing import NamedTuple
 import numpy as np
 
 from mbagent.models.dbn.affected_variables import (
-    COUPLING,
     FIRST,
     MEMBERS,
+    MUTEX,
     OUTPUTS,
     START,
-    Lean,
+    AffectedIndex,
+    affected_variables_of,
     end_rate,
     rates_of,
     show_state,
-    touched_units,
 )
-from mbagent.models.dbn.arrays import meets
-from mbagent.models.dbn.features import Acts
+from mbagent.models.dbn.arrays import are_adjacent
+from mbagent.models.dbn.features import ActionEncoding
 from mbagent.models.dbn.invariants import leave_out
 from mbagent.models.dbn.mutex import leave_out_none
 from mbagent.models.dbn.sampling import only_possible
@@ -61,10 +61,10 @@ class GraphWork(NamedTuple):
         joint: that of a unit or coupling.
         different: factors that are not 0, int64 [F].
         words: units touched, uint64 [W].
-        units: the same, int64 [U].
+        variables: the same, int64 [U].
         values: their present values, int64 [U].
-        coupled: those of them that are in couplings, one coupling after the other, int64 [U].
-        per_coupling: how many are in each, int64 [Q].
+        mutex_members: those of them that are in couplings, one coupling after the other, int64 [U].
+        per_mutex: how many are in each, int64 [Q].
         opened: what is uncertain: a unit and -1, or where a coupling's units begin and how many they are, int64 [U + Q, 2].
         p: particles.
         base: the next state but for what is uncertain, int64 [F].
@@ -76,110 +76,140 @@ class GraphWork(NamedTuple):
     joint: Floats
     different: Ints
     words: Words
-    units: Ints
+    variables: Ints
     values: Ints
-    coupled: Ints
-    per_coupling: Ints
+    mutex_members: Ints
+    per_mutex: Ints
     opened: Ints
     p: Particles
     base: Ints
     following: Ints
 
 
-@implements(work_for, Lean)
+@implements(work_for, AffectedIndex)
 @compiled
-def graph_work(g: Lean, n_grid: int) -> GraphWork:
+def graph_work(g: AffectedIndex, n_grid: int) -> GraphWork:
     """See compiled_model."""
-    n_units, n_factors, n_couplings = len(g.units), len(g.row) - 1, len(g.exactly)
-    width = n_units + n_couplings
+    n_variables, n_factors, n_mutexes = len(g.variables), len(g.row) - 1, len(g.exactly)
+    width = n_variables + n_mutexes
     return GraphWork(
         g.usual_on.copy(),
         np.empty(len(g.base), dtype=np.float64),
-        np.empty(max(g.units[:, OUTPUTS].max(), n_units) + 1, dtype=np.float64),
+        np.empty(max(g.variables[:, OUTPUTS].max(), n_variables) + 1, dtype=np.float64),
         np.empty(n_factors, dtype=np.int64),
         np.empty(g.always.shape[1], dtype=np.uint64),
-        np.empty(n_units, dtype=np.int64),
-        np.empty(n_units, dtype=np.int64),
-        np.empty(n_units, dtype=np.int64),
-        np.zeros(n_couplings, dtype=np.int64),
+        np.empty(n_variables, dtype=np.int64),
+        np.empty(n_variables, dtype=np.int64),
+        np.empty(n_variables, dtype=np.int64),
+        np.zeros(n_mutexes, dtype=np.int64),
         np.empty((width, 2), dtype=np.int64),
-        new_particles(n_grid, width, max(g.units[:, OUTPUTS].max(), n_units) + 1),
+        new_particles(n_grid, width, max(g.variables[:, OUTPUTS].max(), n_variables) + 1),
         np.empty(n_factors, dtype=np.int64),
         np.empty(n_factors, dtype=np.int64),
     )
 
 
-@implements(outcomes, Lean)
+@implements(outcomes, AffectedIndex)
 @compiled
-def graph_outcomes(g: Lean, work: GraphWork, state: Ints, n_grid: int, key: np.uint64, offset: float, out: Outcomes) -> int:
+def graph_outcomes(
+    g: AffectedIndex, work: GraphWork, state: Ints, n_grid: int, key: np.uint64, offset: float, out: Outcomes
+) -> int:
     """See compiled_model."""
     grid, total = (n_grid, key, offset), 0
-    cells, meetings, usual = g.cells, g.meetings, g.usual_on
-    shown, columns, on = g.shown, g.columns, work.on
-    units, members, entries = g.units, g.members, g.entries
+    cells, adjacencies, usual = g.cells, g.adjacencies, g.usual_on
+    shown, features, on = g.shown, g.features, work.on
+    variables, members, entries = g.variables, g.members, g.entries
     entry, node, leaf = g.entry, g.node, g.leaf
-    habit, base_rates, still, noise = g.habit, g.base, g.still, g.noise[0]
+    smoothing, base_rates, still, noise = g.smoothing, g.base, g.still, g.noise[0]
     exactly, row, touched = g.exactly, g.row, g.touched
-    by_meeting, always, rates = g.by_meeting, g.always, work.rates
+    by_adjacency, always, rates = g.by_adjacency, g.always, work.rates
     joint, different, words = work.joint, work.different, work.words
-    listed, values, coupled = work.units, work.values, work.coupled
-    per_coupling, opened, base = work.per_coupling, work.opened, work.base
-    p, acts = work.p, g.acts
+    listed, values, mutex_members = work.variables, work.values, work.mutex_members
+    per_mutex, opened, base = work.per_mutex, work.opened, work.base
+    p, encoding = work.p, g.encoding
     counts, met, weights, late_end = g.counts, g.met, g.weights, len(g.end_first) > 0
-    n_actions, first_meeting = len(always), len(columns) + acts.n_columns
+    n_actions, first_adjacency = len(always), len(features) + encoding.n_features
     place = place_of(state)
-    n_different = show_state(state, shown, columns, different, on)
-    for m in range(len(meetings)):
-        on[first_meeting + m] = meets(state, cells, meetings[m])
+    n_different = show_state(state, shown, features, different, on)
+    for m in range(len(adjacencies)):
+        on[first_adjacency + m] = are_adjacent(state, cells, adjacencies[m])
     for action in range(n_actions):
-        n = touched_units(
-            action, state, different[:n_different], row, touched, by_meeting, always, first_meeting, on, usual, words, listed
+        n = affected_variables_of(
+            action, state, different[:n_different], row, touched, by_adjacency, always, first_adjacency, on, usual, words, listed
         )
-        _show_action(acts, action, len(columns), True, on)
-        way = acts.way[action]
+        _show_action(encoding, action, len(features), True, on)
+        action_class = encoding.action_class[action]
         rates_of(
-            listed[:n], state, way, on, units, members, entries, entry, node, leaf, habit, base_rates, still, noise, values, rates
+            listed[:n],
+            state,
+            action_class,
+            on,
+            variables,
+            members,
+            entries,
+            entry,
+            node,
+            leaf,
+            smoothing,
+            base_rates,
+            still,
+            noise,
+            values,
+            rates,
         )
         for f in range(len(state)):
             base[f] = state[f]
-        begin(p, n_grid, _fits(listed[:n], units, rates, per_coupling, late_end, n_grid), place)
+        begin(p, n_grid, _fits(listed[:n], variables, rates, per_mutex, late_end, n_grid), place)
         n_open, ended = _settle(
-            listed[:n], units, members, exactly, values, rates, joint, coupled, per_coupling, opened, p, base, late_end, grid
+            listed[:n],
+            variables,
+            members,
+            exactly,
+            values,
+            rates,
+            joint,
+            mutex_members,
+            per_mutex,
+            opened,
+            p,
+            base,
+            late_end,
+            grid,
         )
         if late_end:
-            _end(g, work, way, n_open, grid)
+            _end(g, work, action_class, n_open, grid)
             n_open += 1
-        _show_action(acts, action, len(columns), False, on)
-        n_live = _write(total, n_open, ended, base, opened, coupled, units, members, p, n_grid, out)
+        _show_action(encoding, action, len(features), False, on)
+        n_live = _write(total, n_open, ended, base, opened, mutex_members, variables, members, p, n_grid, out)
         if len(counts) or len(met):
             n_live = leave_out(counts, met, weights, cells, state, out.states, out.terminated, out.probabilities, total, n_live)
         out.counts[action], out.left_out[action] = n_live, p.left[0]
         total += n_live
     for i in range(n_different):
-        for column in range(shown[different[i]], shown[different[i] + 1]):
-            on[column] = usual[column]
+        for feature in range(shown[different[i]], shown[different[i] + 1]):
+            on[feature] = usual[feature]
     return total
 
 
 @compiled
-def _end(g: Lean, work: GraphWork, way: int, n_open: int, grid: Grid) -> None:
+def _end(g: AffectedIndex, work: GraphWork, action_class: int, n_open: int, grid: Grid) -> None:
     """Draws whether the episode ends, for each particle given what it became so far."""
-    p, joint, following, opened, end = work.p, work.joint, work.following, work.opened, len(g.units) - 2
+    p, joint, following, opened, end = work.p, work.joint, work.following, work.opened, len(g.variables) - 2
     n_main, n_strata = p.state[MAIN], p.state[STRATA]
     for j in range(n_main + n_strata):
         slot = grid[0] + j if j < n_strata else j - n_strata  # strata first
-        _fill(following, work.base, opened, n_open, work.coupled, g.units, g.members, p.factors[slot])
+        _fill(following, work.base, opened, n_open, work.mutex_members, g.variables, g.members, p.factors[slot])
         joint[1] = end_rate(
-            g.end_first[way],
+            g.end_first[action_class],
             g.end_node,
             g.end_rate,
             0.0,
             following,
             work.on,
             g.factor,
-            g.columns,
+            g.features,
             g.cells,
-            g.next_meetings,
+            g.next_adjacencies,
         )
         joint[0] = 1.0 - joint[1]
         share_out(p, slot, end, n_open, joint, 2, True, grid)
@@ -187,86 +217,86 @@ def _end(g: Lean, work: GraphWork, way: int, n_open: int, grid: Grid) -> None:
 
 
 @inlined
-def _show_action(acts: Acts, action: int, first: int, shown: bool, on: Bools) -> None:
+def _show_action(encoding: ActionEncoding, action: int, first: int, shown: bool, on: Bools) -> None:
     """Switches an action's columns, which begin at ``first``, on or off."""
-    for i in range(acts.first[action], acts.first[action + 1]):
-        on[first + acts.column[i]] = shown
+    for i in range(encoding.first[action], encoding.first[action + 1]):
+        on[first + encoding.feature[i]] = shown
 
 
 @compiled
-def _fits(touched: Ints, units: Ints, rates: Floats, per_coupling: Ints, ends_late: bool, n_grid: int) -> bool:
-    """Whether all outcomes of a row can be listed; ``per_coupling`` is all 0, and is so again afterwards."""
+def _fits(touched: Ints, variables: Ints, rates: Floats, per_mutex: Ints, end_is_synchronic: bool, n_grid: int) -> bool:
+    """Whether all outcomes of a row can be listed; ``per_mutex`` is all 0, and is so again afterwards."""
     possible = 1
-    for unit in touched:
-        coupling = units[unit, COUPLING]
-        if coupling >= 0:
-            rate = rates[units[unit, START] + 1]  # as ``couplings.n_choices``
-            per_coupling[coupling] += int(rate > 0.0) + (_SURE if rate >= 1.0 else 0)
-        elif not (ends_late and unit == len(units) - 2):
-            possible = min(possible * n_possible(rates, units[unit, START], units[unit, OUTPUTS]), n_grid + 1)
-    for unit in touched:
-        coupling = units[unit, COUPLING]
-        if coupling >= 0 and per_coupling[coupling] > 0:
-            choices = per_coupling[coupling] % _SURE + int(per_coupling[coupling] < _SURE)
+    for variable in touched:
+        mutex = variables[variable, MUTEX]
+        if mutex >= 0:
+            rate = rates[variables[variable, START] + 1]  # as ``couplings.n_choices``
+            per_mutex[mutex] += int(rate > 0.0) + (_SURE if rate >= 1.0 else 0)
+        elif not (end_is_synchronic and variable == len(variables) - 2):
+            possible = min(possible * n_possible(rates, variables[variable, START], variables[variable, OUTPUTS]), n_grid + 1)
+    for variable in touched:
+        mutex = variables[variable, MUTEX]
+        if mutex >= 0 and per_mutex[mutex] > 0:
+            choices = per_mutex[mutex] % _SURE + int(per_mutex[mutex] < _SURE)
             possible = min(possible * choices, n_grid + 1)
-            per_coupling[coupling] = 0
+            per_mutex[mutex] = 0
     return possible <= n_grid
 
 
 @inlined
 def _settle(
     touched: Ints,
-    units: Ints,
+    variables: Ints,
     members: Ints,
     exactly: Bools,
     values: Ints,
     rates: Floats,
     joint: Floats,
-    coupled: Ints,
-    per_coupling: Ints,
+    mutex_members: Ints,
+    per_mutex: Ints,
     opened: Ints,
     p: Particles,
     base: Ints,
-    ends_late: bool,
+    end_is_synchronic: bool,
     grid: Grid,
 ) -> tuple[int, bool]:
     """Writes what is sure to ``base`` and shares the particles over the rest; returns (open ones, whether it ends)."""
-    n_units, n_open, ended = len(units), 0, False
+    n_variables, n_open, ended = len(variables), 0, False
     for i in range(len(touched)):
-        unit = touched[i]
-        if units[unit, COUPLING] >= 0:
-            per_coupling[units[unit, COUPLING]] += 1
+        variable = touched[i]
+        if variables[variable, MUTEX] >= 0:
+            per_mutex[variables[variable, MUTEX]] += 1
             continue
-        if ends_late and unit == n_units - 2:
+        if end_is_synchronic and variable == n_variables - 2:
             continue
-        n, start = units[unit, OUTPUTS], units[unit, START]
+        n, start = variables[variable, OUTPUTS], variables[variable, START]
         best = only_possible(rates, start, n)
         if best < 0:
             for k in range(n):
                 joint[k] = rates[start + k]
-            share_out(p, -1, unit, n_open, joint, n, unit == n_units - 2, grid)
-            opened[n_open, 0], opened[n_open, 1] = unit, -1
+            share_out(p, -1, variable, n_open, joint, n, variable == n_variables - 2, grid)
+            opened[n_open, 0], opened[n_open, 1] = variable, -1
             n_open += 1
-        elif unit == n_units - 2:
+        elif variable == n_variables - 2:
             ended = best == 1
         elif best != values[i]:
-            _put(base, unit, best, units, members)
-    n_open = _settle_couplings(
-        touched, units, members, exactly, rates, joint, coupled, per_coupling, opened, p, base, n_open, grid
+            _put(base, variable, best, variables, members)
+    n_open = _settle_mutexes(
+        touched, variables, members, exactly, rates, joint, mutex_members, per_mutex, opened, p, base, n_open, grid
     )
     return n_open, ended
 
 
 @inlined
-def _settle_couplings(
+def _settle_mutexes(
     touched: Ints,
-    units: Ints,
+    variables: Ints,
     members: Ints,
     exactly: Bools,
     rates: Floats,
     joint: Floats,
-    coupled: Ints,
-    per_coupling: Ints,
+    mutex_members: Ints,
+    per_mutex: Ints,
     opened: Ints,
     p: Particles,
     base: Ints,
@@ -274,17 +304,17 @@ def _settle_couplings(
     grid: Grid,
 ) -> int:
     """The same for couplings."""
-    n_units, first = len(units), 0
+    n_variables, first = len(variables), 0
     for q in range(len(exactly)):
-        n = per_coupling[q]
+        n = per_mutex[q]
         if n == 0:
             continue
-        per_coupling[q] = 0
-        best = _couple(q, first, touched, units, exactly[q], rates, coupled, joint)
+        per_mutex[q] = 0
+        best = _mutex_distribution(q, first, touched, variables, exactly[q], rates, mutex_members, joint)
         if best >= 0:
-            _choose(base, coupled, first, n, best, units, members)
+            _choose(base, mutex_members, first, n, best, variables, members)
         else:
-            share_out(p, -1, n_units + q, n_open, joint, n + 1, False, grid)
+            share_out(p, -1, n_variables + q, n_open, joint, n + 1, False, grid)
             opened[n_open, 0], opened[n_open, 1] = first, n
             n_open += 1
         first += n
@@ -298,8 +328,8 @@ def _write(
     ended: bool,
     base: Ints,
     opened: Ints,
-    coupled: Ints,
-    units: Ints,
+    mutex_members: Ints,
+    variables: Ints,
     members: Ints,
     p: Particles,
     n_grid: int,
@@ -311,7 +341,7 @@ def _write(
     for i in range(n_outcomes(p)):
         slot = slot_of(p, i, n_grid)
         terminated[total + i] = ended
-        last = _fill(states[total + i], base, opened, n_open, coupled, units, members, factors[slot])
+        last = _fill(states[total + i], base, opened, n_open, mutex_members, variables, members, factors[slot])
         if last >= 0:
             terminated[total + i] = factors[slot, last] == 1
         probabilities[total + i] = p.chances[slot, MASS]
@@ -319,35 +349,37 @@ def _write(
 
 
 @inlined
-def _fill(state: Ints, base: Ints, opened: Ints, n_open: int, coupled: Ints, units: Ints, members: Ints, chosen: Ints) -> int:
+def _fill(
+    state: Ints, base: Ints, opened: Ints, n_open: int, mutex_members: Ints, variables: Ints, members: Ints, chosen: Ints
+) -> int:
     """Writes the next state [F] that a particle stands for; returns which of the open ones is the end, or -1."""
-    end, n_units = -1, len(units)
+    end, n_variables = -1, len(variables)
     for f in range(len(base)):
         state[f] = base[f]
     for v in range(n_open):
         number, n = opened[v, 0], opened[v, 1]
         if n >= 0:
-            _choose(state, coupled, number, n, chosen[v], units, members)
-        elif number == n_units - 2:
+            _choose(state, mutex_members, number, n, chosen[v], variables, members)
+        elif number == n_variables - 2:
             end = v
         else:
-            _put(state, number, chosen[v], units, members)
+            _put(state, number, chosen[v], variables, members)
     return int(end)
 
 
 @inlined
-def _couple(
-    coupling: int, first: int, touched: Ints, units: Ints, exactly: bool, rates: Floats, coupled: Ints, out: Floats
+def _mutex_distribution(
+    mutex: int, first: int, touched: Ints, variables: Ints, exactly: bool, rates: Floats, mutex_members: Ints, out: Floats
 ) -> int:
-    """Lists a coupling's touched units from ``coupled[first]`` on, and their chances; returns the only one worth drawing, or -1.
+    """Lists a coupling's touched units from ``mutex_members[first]`` on, and their chances; returns the only one worth drawing, or -1.
 
-    As ``couplings.couple``; the last chance is that of none.
+    As ``mutexes.mutex_distribution``; the last chance is that of none.
     """
     n, total = 0, 0.0
-    for unit in touched:
-        if units[unit, COUPLING] == coupling:
-            coupled[first + n] = unit
-            out[n] = rates[units[unit, START] + 1]
+    for variable in touched:
+        if variables[variable, MUTEX] == mutex:
+            mutex_members[first + n] = variable
+            out[n] = rates[variables[variable, START] + 1]
             total += out[n]
             n += 1
     none = 0.0 if exactly and total > 1e-9 else max(0.0, 1.0 - total)
@@ -359,16 +391,16 @@ def _couple(
 
 
 @inlined
-def _choose(state: Ints, coupled: Ints, first: int, n: int, chosen: int, units: Ints, members: Ints) -> None:
+def _choose(state: Ints, mutex_members: Ints, first: int, n: int, chosen: int, variables: Ints, members: Ints) -> None:
     """Switches one of a coupling's listed bits on and the others off."""
     for k in range(n):
-        state[members[units[coupled[first + k], FIRST]]] = 1 if k == chosen else 0
+        state[members[variables[mutex_members[first + k], FIRST]]] = 1 if k == chosen else 0
 
 
 @inlined
-def _put(state: Ints, unit: int, value: int, units: Ints, members: Ints) -> None:
+def _put(state: Ints, variable: int, value: int, variables: Ints, members: Ints) -> None:
     """Gives a unit its value."""
-    first, n = units[unit, FIRST], units[unit, MEMBERS]
+    first, n = variables[variable, FIRST], variables[variable, MEMBERS]
     if n == 1:
         state[members[first]] = value
     for member in range(n if n > 1 else 0):

@@ -19,20 +19,20 @@ from scipy.special import gammainc, ndtr
 from mbagent.data import Factors, TransitionBatch
 from mbagent.models.dbn import sampling
 from mbagent.models.dbn.arrays import Graphs, build
-from mbagent.models.dbn.effects import WHERE, Asking, ask_in, for_all_ways, habit_in
+from mbagent.models.dbn.effects import ABSOLUTE_EFFECT, EffectModel, for_all_actions, questions_for_effect, smoothing_for_effect
 from mbagent.models.dbn.features import (
-    Acts,
+    ActionEncoding,
     Layout,
+    Observed,
     Question,
-    Seen,
-    column_kinds,
-    column_table,
-    coupled_layout,
     distinct,
+    feature_kinds,
+    feature_table,
     is_lone_bit,
-    lay_out,
+    layout_with_mutexes,
+    make_layout,
     shown,
-    unit_values,
+    variable_values,
 )
 from mbagent.models.dbn.mutex import find_cliques, find_groups
 from mbagent.models.dbn.split_search import find_splits
@@ -44,7 +44,7 @@ USUAL = 0.95
 """Share of transitions that are taken for usual in any case."""
 
 
-def flag_events(states: Factors, next_states: Factors) -> Bools:
+def flag_resets(states: Factors, next_states: Factors) -> Bools:
     """Which transitions look like a rare event, bool [N].
 
     Those that change more than twice as many factors as nearly all others, and those that change factors which otherwise
@@ -58,8 +58,8 @@ def flag_events(states: Factors, next_states: Factors) -> Bools:
     count = changed.sum(axis=1)
     usual = count <= 2 * max(1.0, float(np.quantile(count, USUAL))) if len(count) else np.ones(0, dtype=np.bool_)
     still = ~changed[usual].any(axis=0)
-    events: Bools = changed[:, still].any(axis=1)
-    return events
+    resets: Bools = changed[:, still].any(axis=1)
+    return resets
 
 
 UNCERTAIN = 2.0
@@ -79,22 +79,22 @@ AT_ONCE = 2000
 """Rows that are handed to the compiled kernels at once, which read wide integers."""
 
 
-def uncertain_rows(rows: TransitionBatch, layout: Layout, graphs: Graphs, units: Ints) -> Bools:
+def uncertain_rows(rows: TransitionBatch, layout: Layout, graphs: Graphs, variables: Ints) -> Bools:
     """In which rows some units need their late graphs, bool [N, len(units)]."""
-    found = [sampling.uncertain(part.states, part.actions, layout, graphs, units) for part in rows.parts(AT_ONCE)]
-    return np.concatenate([np.zeros((0, len(units)), dtype=np.bool_), *found])
+    found = [sampling.uncertain(part.states, part.actions, layout, graphs, variables) for part in rows.parts(AT_ONCE)]
+    return np.concatenate([np.zeros((0, len(variables)), dtype=np.bool_), *found])
 
 
 class Asked(NamedTuple):
     """What a unit is asked again with.
 
     Attributes:
-        unit: its number.
-        columns: columns of the next state, numbered as those of the state.
+        variable: its number.
+        features: columns of the next state, numbered as those of the state.
     """
 
-    unit: int
-    columns: Ints
+    variable: int
+    features: Ints
 
 
 def probabilities(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Floats:
@@ -153,13 +153,13 @@ def find_dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, usual:
         rows: N transitions.
         usual: those that are no rare events, int64 [R].
     """
-    n_columns, last = len(layout.factor), len(layout.outputs) - 2
-    unit_of = np.empty(layout.n_factors, dtype=np.int64)
-    unit_of[layout.members] = np.repeat(np.arange(len(layout.outputs)), np.diff(layout.first))
-    owner = unit_of[layout.factor]
-    most = max(1000, MOST_ENTRIES // max(n_columns, 1))
+    n_features, last = len(layout.factor), len(layout.outputs) - 2
+    variable_of = np.empty(layout.n_factors, dtype=np.int64)
+    variable_of[layout.members] = np.repeat(np.arange(len(layout.outputs)), np.diff(layout.first))
+    owner = variable_of[layout.factor]
+    most = max(1000, MOST_ENTRIES // max(n_features, 1))
     some = rows.select(usual[np.linspace(0, len(usual) - 1, min(len(usual), most)).astype(np.int64)])
-    found = [Asked(unit, columns) for unit, columns in _dependent(layout, graphs, some, owner).items()]
+    found = [Asked(variable, features) for variable, features in _dependent(layout, graphs, some, owner).items()]
     if last in graphs.changing:
         found.append(Asked(last, np.flatnonzero(np.isin(owner, graphs.changing))))
     return found
@@ -177,16 +177,18 @@ def _dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, owner: Int
     for action in np.unique(rows.actions):  # what goes together under one action may go apart under another
         e, v = error[rows.actions == action], spread[rows.actions == action][:, uncertain]
         telling |= _telling(e, e, v, v, len(uncertain))
-    unit, coupling = owner[uncertain], layout.coupling_of[owner[uncertain]]
-    earlier = unit[:, None] < unit
-    together = (coupling[:, None] == coupling) & (coupling >= 0)
-    goes = earlier & ~together & (coupling < 0) & telling
+    variable, mutex = owner[uncertain], layout.mutex_of[owner[uncertain]]
+    earlier = variable[:, None] < variable
+    together = (mutex[:, None] == mutex) & (mutex >= 0)
+    goes = earlier & ~together & (mutex < 0) & telling
     return {
-        int(u): uncertain[goes[:, unit == u].any(axis=1)] for u in np.unique(unit[goes.any(axis=0)]) if goes[:, unit == u].any()
+        int(u): uncertain[goes[:, variable == u].any(axis=1)]
+        for u in np.unique(variable[goes.any(axis=0)])
+        if goes[:, variable == u].any()
     }
 
 
-NO_MANNERS: Mapping[int, Asking] = MappingProxyType({})
+NO_EFFECTS: Mapping[int, EffectModel] = MappingProxyType({})
 """All factors are asked where they go."""
 
 SOME_ROWS = 4000
@@ -200,17 +202,17 @@ class Fitted:
     Attributes:
         layout: the units.
         usual: graphs of all units, each for itself, and of whether the event happens.
-        late: graphs of the units that are drawn after the others, given what those became, in order.
-        event: graphs of what happens in an event; as ``usual`` where there is none.
-        has_event: whether there is one.
-        asked, found: questions and splits behind ``usual`` and ``late``.
+        synchronic: graphs of the units that are drawn after the others, given what those became, in order.
+        reset: graphs of what happens in an event; as ``usual`` where there is none.
+        has_reset: whether there is one.
+        asked, found: questions and splits behind ``usual`` and ``synchronic``.
     """
 
     layout: Layout
     usual: Graphs
-    late: Graphs
-    event: Graphs
-    has_event: bool
+    synchronic: Graphs
+    reset: Graphs
+    has_reset: bool
     asked: Sequence[Question]
     found: Sequence[Search]
 
@@ -218,8 +220,8 @@ class Fitted:
 def for_planning(fitted: Fitted) -> Fitted:
     """The graphs as planners read them: what no observation stands behind is no outcome, all else is one, however rare."""
     noise = np.full(1, NEGLIGIBLE)
-    usual, late, event = (graphs._replace(noise=noise) for graphs in (fitted.usual, fitted.late, fitted.event))
-    return replace(fitted, usual=usual, late=late, event=event)
+    usual, synchronic, reset = (graphs._replace(noise=noise) for graphs in (fitted.usual, fitted.synchronic, fitted.reset))
+    return replace(fitted, usual=usual, synchronic=synchronic, reset=reset)
 
 
 class _Table:
@@ -228,13 +230,13 @@ class _Table:
     Args:
         layout: the units.
         rows: N transitions.
-        events: which of them are rare events, bool [N].
-        manners: how factors are asked about, if not where they go.
+        resets: which of them are rare events, bool [N].
+        effects: how factors are asked about, if not where they go.
         since: first row that counts for each factor and for ``terminated``, int64 [F + 1]; None for all.
     """
 
     def __init__(
-        self, layout: Layout, rows: TransitionBatch, events: Bools, manners: Mapping[int, Asking], since: Ints | None
+        self, layout: Layout, rows: TransitionBatch, resets: Bools, effects: Mapping[int, EffectModel], since: Ints | None
     ) -> None:
         """See the class."""
         self.layout, self.rows = layout, rows
@@ -244,124 +246,131 @@ class _Table:
             self.since[:-2] = [since[factors].max() for factors in members[:-2]]
             self.since[-2] = since[-1]
         lone = np.flatnonzero(np.diff(layout.first) == 1)
-        self.manners = {int(unit): manners.get(int(layout.members[layout.first[unit]]), WHERE) for unit in lone}
-        flags = np.stack([rows.terminated, events], axis=1).astype(np.uint8)
-        self.now = np.concatenate([unit_values(layout, rows.before), np.zeros_like(flags)], axis=1)
-        self.then = np.concatenate([unit_values(layout, rows.after), flags], axis=1)
+        self.effects = {
+            int(variable): effects.get(int(layout.members[layout.first[variable]]), ABSOLUTE_EFFECT) for variable in lone
+        }
+        flags = np.stack([rows.terminated, resets], axis=1).astype(np.uint8)
+        self.now = np.concatenate([variable_values(layout, rows.before), np.zeros_like(flags)], axis=1)
+        self.then = np.concatenate([variable_values(layout, rows.after), flags], axis=1)
         first, self.pattern = distinct(rows.before, rows.actions)
-        self.first, self.columns = first, column_table(layout, rows.before[first], rows.actions[first])
+        self.first, self.features = first, feature_table(layout, rows.before[first], rows.actions[first])
 
-    def ask(self, unit: int, which: Ints) -> list[Question]:
+    def ask(self, variable: int, which: Ints) -> list[Question]:
         """The questions about a unit, of some rows."""
-        return self.questions(unit, self.seen(unit).select(self.counting(unit, which)))
+        return self.questions(variable, self.observed(variable).select(self.counting(variable, which)))
 
-    def counting(self, unit: int, which: Ints) -> Ints:
+    def counting(self, variable: int, which: Ints) -> Ints:
         """Those of some rows that count for a unit."""
-        result: Ints = which[which >= self.since[unit]]
+        result: Ints = which[which >= self.since[variable]]
         return result
 
-    def questions(self, unit: int, seen: Seen) -> list[Question]:
+    def questions(self, variable: int, observed: Observed) -> list[Question]:
         """The questions about a unit, of rows with whatever looks."""
-        manner, partner = self.manners.get(unit, WHERE)
-        n_ways = self.layout.acts.n_ways if partner is None else partner.cardinality
-        asked = ask_in(manner, unit, int(self.layout.outputs[unit]), n_ways, seen)
-        return asked if partner is None else [replace(one, partner=partner.columns(self.layout)) for one in asked]
+        effect, operand = self.effects.get(variable, ABSOLUTE_EFFECT)
+        n_action_classes = self.layout.encoding.n_action_classes if operand is None else operand.cardinality
+        asked = questions_for_effect(effect, variable, int(self.layout.outputs[variable]), n_action_classes, observed)
+        return asked if operand is None else [replace(one, operand=operand.features(self.layout)) for one in asked]
 
-    def seen(self, unit: int) -> Seen:
+    def observed(self, variable: int) -> Observed:
         """A unit's values in all rows, with the action or what takes its place."""
-        now, then = (values[:, unit].astype(np.int64) for values in (self.now, self.then))
-        partner = self.manners.get(unit, WHERE).partner
-        ways = self.layout.acts.way[self.rows.actions] if partner is None else partner.of(self.rows)
-        return Seen(self.pattern, ways, now, then)
+        now, then = (values[:, variable].astype(np.int64) for values in (self.now, self.then))
+        operand = self.effects.get(variable, ABSOLUTE_EFFECT).operand
+        action_classes = self.layout.encoding.action_class[self.rows.actions] if operand is None else operand.of(self.rows)
+        return Observed(self.pattern, action_classes, now, then)
 
-    def kinds(self, seen: Ints) -> Ints:
+    def kinds(self, observed: Ints) -> Ints:
         """Kind of each column, by some rows."""
-        changing = (self.rows.before[seen] != self.rows.after[seen]).any(axis=0)
-        return column_kinds(self.layout, self.rows.before[seen], changing)
+        changing = (self.rows.before[observed] != self.rows.after[observed]).any(axis=0)
+        return feature_kinds(self.layout, self.rows.before[observed], changing)
 
-    def build(self, asked: Sequence[Question], found: Sequence[Search], seen: Ints, still: float) -> Graphs:
+    def build(self, asked: Sequence[Question], found: Sequence[Search], observed: Ints, still: float) -> Graphs:
         """The graphs; habits are those of the rows seen."""
-        habits, n_ways = [], self.layout.acts.n_ways
-        for unit, cardinality in enumerate(self.layout.outputs):
-            some, (manner, partner) = self.seen(unit).select(self.counting(unit, seen)), self.manners.get(unit, WHERE)
-            habit = habit_in(manner, int(cardinality), n_ways if partner is None else partner.cardinality, some)
-            habits.append(habit if partner is None else for_all_ways(habit, partner.cardinality, n_ways))
-        return build(self.layout, asked, found, habits, still)
+        smoothings, n_action_classes = [], self.layout.encoding.n_action_classes
+        for variable, cardinality in enumerate(self.layout.outputs):
+            some, (effect, operand) = (
+                self.observed(variable).select(self.counting(variable, observed)),
+                self.effects.get(variable, ABSOLUTE_EFFECT),
+            )
+            smoothing = smoothing_for_effect(
+                effect, int(cardinality), n_action_classes if operand is None else operand.cardinality, some
+            )
+            smoothings.append(smoothing if operand is None else for_all_actions(smoothing, operand.cardinality, n_action_classes))
+        return build(self.layout, asked, found, smoothings, still)
 
 
-def nothing_late(graphs: Graphs) -> Graphs:
+def no_synchronic(graphs: Graphs) -> Graphs:
     """Graphs of no unit, for where nothing is drawn late."""
-    return graphs._replace(changing=np.zeros(0, dtype=np.int64), column=np.full_like(graphs.column, -1))
+    return graphs._replace(changing=np.zeros(0, dtype=np.int64), feature=np.full_like(graphs.feature, -1))
 
 
 def fit_graphs(
     cardinalities: Sequence[int],
-    acts: Acts,
+    encoding: ActionEncoding,
     rows: TransitionBatch,
-    events: Bools,
+    resets: Bools,
     in_pairs: bool = True,
     jointly: bool = True,
-    manners: Mapping[int, Asking] = NO_MANNERS,
+    effects: Mapping[int, EffectModel] = NO_EFFECTS,
     since: Ints | None = None,
 ) -> Fitted:
     """Fits everything.
 
     Args:
         cardinalities: number of values of each factor.
-        acts: the actions.
+        encoding: the actions.
         rows: N transitions.
-        events: which of them are rare events, bool [N].
+        resets: which of them are rare events, bool [N].
         in_pairs: whether to look for causes that matter only together, which takes most of the time.
         jointly: whether to look for units that hang on what others become.
-        manners: how factors are asked about, if not where they go.
+        effects: how factors are asked about, if not where they go.
         since: first row that counts for each factor and for ``terminated``, int64 [F + 1]; None for all.
     """
-    groups = find_groups(cardinalities, rows.before, rows.after, ~events)
-    layout = lay_out(cardinalities, groups, acts)
-    table, usual = _Table(layout, rows, events, manners, since), np.flatnonzero(~events)
+    groups = find_groups(cardinalities, rows.before, rows.after, ~resets)
+    layout = make_layout(cardinalities, groups, encoding)
+    table, usual = _Table(layout, rows, resets, effects, since), np.flatnonzero(~resets)
     last = len(layout.outputs) - 1
-    asked_of = {unit: np.arange(len(rows)) if unit == last else usual for unit in range(last + 1)}
+    asked_of = {variable: np.arange(len(rows)) if variable == last else usual for variable in range(last + 1)}
     graphs, asked, found = _graphs(table, asked_of, usual, True, in_pairs)
-    layout = _coupled(layout, graphs, rows)
-    late = nothing_late(graphs)
+    layout = _with_mutexes(layout, graphs, rows)
+    synchronic = no_synchronic(graphs)
     if jointly:
-        late, more_asked, more_found = _late_graphs(table, layout, graphs, usual, in_pairs)
+        synchronic, more_asked, more_found = _synchronic_graphs(table, layout, graphs, usual, in_pairs)
         asked, found = [*asked, *more_asked], [*found, *more_found]
-    event = graphs
-    if events.any():
-        rare = np.flatnonzero(events)
-        event, _, _ = _graphs(table, dict.fromkeys(range(last), rare), rare, False, in_pairs)
-    return Fitted(layout, graphs, late, event, bool(events.any()), asked, found)
+    reset = graphs
+    if resets.any():
+        rare = np.flatnonzero(resets)
+        reset, _, _ = _graphs(table, dict.fromkeys(range(last), rare), rare, False, in_pairs)
+    return Fitted(layout, graphs, synchronic, reset, bool(resets.any()), asked, found)
 
 
-def _late_graphs(
+def _synchronic_graphs(
     table: _Table, layout: Layout, graphs: Graphs, usual: Ints, in_pairs: bool
 ) -> tuple[Graphs, list[Question], list[Search]]:
     """Graphs of units that hang on what others become, with questions and splits."""
-    rows, kinds, n_columns = table.rows, table.kinds(usual), table.columns.shape[1]
-    late, all_asked, all_found = [], [], []
-    for unit, columns in find_dependent(layout, graphs, rows, usual):
-        counting = table.counting(unit, usual)
-        needed = uncertain_rows(rows.select(counting), layout, graphs, np.asarray([unit]))[:, 0]
-        some = table.seen(unit).select(counting[needed])
-        following = shown(layout, rows.after[counting[needed]], columns)
+    rows, kinds, n_features = table.rows, table.kinds(usual), table.features.shape[1]
+    synchronic, all_asked, all_found = [], [], []
+    for variable, features in find_dependent(layout, graphs, rows, usual):
+        counting = table.counting(variable, usual)
+        needed = uncertain_rows(rows.select(counting), layout, graphs, np.asarray([variable]))[:, 0]
+        some = table.observed(variable).select(counting[needed])
+        following = shown(layout, rows.after[counting[needed]], features)
         first, pattern = distinct(following, some.pattern)
-        asked = table.questions(unit, replace(some, pattern=pattern))
-        more_kinds = np.concatenate([kinds, kinds.max(initial=0) + 1 + kinds[columns]])
-        more = np.concatenate([table.columns[some.pattern[first]], following[first]], axis=1)
-        found = find_splits([q.head for q in asked], more, more_kinds, layout.acts.n_ways, in_pairs)
-        if any(split.column >= n_columns for search in found for split in search.splits):
-            numbers = np.concatenate([np.arange(n_columns), n_columns + columns])
-            late.append(unit)
+        asked = table.questions(variable, replace(some, pattern=pattern))
+        more_kinds = np.concatenate([kinds, kinds.max(initial=0) + 1 + kinds[features]])
+        more = np.concatenate([table.features[some.pattern[first]], following[first]], axis=1)
+        found = find_splits([q.target for q in asked], more, more_kinds, layout.encoding.n_action_classes, in_pairs)
+        if any(split.feature >= n_features for search in found for split in search.splits):
+            numbers = np.concatenate([np.arange(n_features), n_features + features])
+            synchronic.append(variable)
             all_asked += asked
             all_found += [search.renamed(numbers) for search in found]
-    if not late:
-        return nothing_late(graphs), [], []
+    if not synchronic:
+        return no_synchronic(graphs), [], []
     built = table.build(all_asked, all_found, usual, float(graphs.still[0]))
-    return built._replace(changing=np.asarray(late, dtype=np.int64)), all_asked, all_found
+    return built._replace(changing=np.asarray(synchronic, dtype=np.int64)), all_asked, all_found
 
 
-def _coupled(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Layout:
+def _with_mutexes(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Layout:
     """The layout with those bits coupled that are never on together, though each for itself might be."""
     bits = graphs.changing[is_lone_bit(layout)[graphs.changing]]
     if len(bits) < 2 or len(rows) == 0:
@@ -375,7 +384,7 @@ def _coupled(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Layout:
     sampling.marginals(few.states, few.actions, layout, graphs, start, probs)
     ones = probs[:, start[factors] + 1]
     expected = ones.T @ ones * (len(rows) / len(some))
-    return coupled_layout(layout, [bits[c] for c in find_cliques(np.rint(on.T @ on).astype(np.int64), expected)])
+    return layout_with_mutexes(layout, [bits[c] for c in find_cliques(np.rint(on.T @ on).astype(np.int64), expected)])
 
 
 def _cardinalities(layout: Layout) -> NDArray[np.int64]:
@@ -387,14 +396,16 @@ def _cardinalities(layout: Layout) -> NDArray[np.int64]:
 
 
 def _graphs(
-    table: _Table, asked_of: dict[int, Ints], seen: Ints, regular: bool, in_pairs: bool
+    table: _Table, asked_of: dict[int, Ints], observed: Ints, regular: bool, in_pairs: bool
 ) -> tuple[Graphs, list[Question], list[Search]]:
-    """Graphs of some units, each asked of some rows; ``seen`` are the rows of this regime.
+    """Graphs of some units, each asked of some rows; ``observed`` are the rows of this regime.
 
     In a ``regular`` regime units that never changed are all taken together for how likely they are to change; where
     anything may change, each for itself.
     """
-    asked = [question for unit, which in asked_of.items() for question in table.ask(unit, which)]
-    found = find_splits([q.head for q in asked], table.columns, table.kinds(seen), table.layout.acts.n_ways, in_pairs)
-    still = 0.5 / (len(seen) * (len(table.layout.outputs) if regular else 1) + 1.0)
-    return table.build(asked, found, seen, still), asked, found
+    asked = [question for variable, which in asked_of.items() for question in table.ask(variable, which)]
+    found = find_splits(
+        [q.target for q in asked], table.features, table.kinds(observed), table.layout.encoding.n_action_classes, in_pairs
+    )
+    still = 0.5 / (len(observed) * (len(table.layout.outputs) if regular else 1) + 1.0)
+    return table.build(asked, found, observed, still), asked, found

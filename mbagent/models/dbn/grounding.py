@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mbagent.models.dbn.arrays import Graphs, linked, n_columns
-from mbagent.models.dbn.features import Acts, Layout, coupled_layout, lay_out
-from mbagent.models.dbn.invariants import LAWLESS, Laws, radix
-from mbagent.models.dbn.plane_features import ACTION, BORDER, MEETING, NEXT, NEXT_MEETING, WRAP
+from mbagent.models.dbn.arrays import Graphs, linked, n_features
+from mbagent.models.dbn.features import ActionEncoding, Layout, layout_with_mutexes, make_layout
+from mbagent.models.dbn.invariants import NO_INVARIANTS, Invariants, radix
+from mbagent.models.dbn.plane_features import ACTION, ADJACENCY, BORDER, NEXT, NEXT_ADJACENCY, WRAP
 from mbagent.spaces import PlaneLayout
 from mbagent.types import Ints
 
@@ -19,7 +19,7 @@ WHOLE, ROW, COLUMN = 0, 1, 2
 """What cells of a channel a coupling is about."""
 
 
-class Coupling(NamedTuple):
+class Mutex(NamedTuple):
     """Cells of a channel of which at most one is on after a step.
 
     Attributes:
@@ -42,8 +42,8 @@ class Coupling(NamedTuple):
     def cells(self) -> tuple[slice | int, slice | int]:
         """Its rows and columns."""
         rows = self.line if self.kind == ROW else slice(None)
-        columns = self.line if self.kind == COLUMN else slice(None)
-        return rows, columns
+        cols = self.line if self.kind == COLUMN else slice(None)
+        return rows, cols
 
 
 @dataclass(frozen=True)
@@ -52,21 +52,21 @@ class LocalGraphs:
 
     Attributes:
         graphs: units are the channels, then ``terminated`` and the event; columns are relative.
-        late: those of channels whose cells are drawn late, from the upper left on, channel after channel.
-        columns: the relative columns, int64 [D, 7], see ``windows.py``.
+        synchronic: those of channels whose cells are drawn late, from the upper left on, channel after channel.
+        features: the relative columns, int64 [D, 7], see ``windows.py``.
         cardinalities: number of values of each channel's cells, length C.
-        acts: the actions.
-        couplings: bits of which at most one is on.
-        laws: what every state keeps to.
+        encoding: the actions.
+        mutexes: bits of which at most one is on.
+        invariants: what every state keeps to.
     """
 
     graphs: Graphs
-    late: Graphs
-    columns: Ints
+    synchronic: Graphs
+    features: Ints
     cardinalities: tuple[int, ...]
-    acts: Acts
-    couplings: tuple[Coupling, ...]
-    laws: Laws = LAWLESS
+    encoding: ActionEncoding
+    mutexes: tuple[Mutex, ...]
+    invariants: Invariants = NO_INVARIANTS
 
 
 def instantiate(local: LocalGraphs, board: PlaneLayout) -> tuple[Layout, Graphs, Graphs]:
@@ -76,60 +76,60 @@ def instantiate(local: LocalGraphs, board: PlaneLayout) -> tuple[Layout, Graphs,
     cardinalities = np.empty(n_factors, dtype=np.int64)
     for channel, values in enumerate(local.cardinalities):
         cardinalities[cells[channel]] = values
-    asked = np.concatenate([local.graphs.column, local.late.column])
+    asked = np.concatenate([local.graphs.feature, local.synchronic.feature])
     used = np.unique(asked[asked >= 0])
-    meetings, later = (used[local.columns[used, 0] == kind] for kind in (MEETING, NEXT_MEETING))
-    layout = lay_out([int(c) for c in cardinalities], (), local.acts, ordinal=False)
-    now, then = (np.ascontiguousarray(local.columns[numbers, 1:]) for numbers in (meetings, later))
-    layout = layout._replace(cells=cells, meetings=now, next_meetings=then, weights=radix(local.cardinalities))
-    layout = with_couplings(with_laws(layout, local.laws), local.couplings)
-    numbers = {int(d): len(layout.factor) + layout.acts.n_columns + i for i, d in enumerate(meetings)}
-    numbers |= {int(d): n_columns(layout) + len(layout.factor) + i for i, d in enumerate(later)}
-    graphs, late = (_Board(local, layout, numbers).graphs(which) for which in (local.graphs, local.late))
-    units = [layout.cells[c].ravel() if c < len(cells) else np.asarray([n_factors]) for c in local.late.changing]
-    order = np.concatenate([*units, np.zeros(0, dtype=np.int64)])
-    return layout, graphs, late._replace(changing=order[layout.coupling_of[order] < 0])
+    adjacencies, later = (used[local.features[used, 0] == kind] for kind in (ADJACENCY, NEXT_ADJACENCY))
+    layout = make_layout([int(c) for c in cardinalities], (), local.encoding, ordinal=False)
+    now, then = (np.ascontiguousarray(local.features[numbers, 1:]) for numbers in (adjacencies, later))
+    layout = layout._replace(cells=cells, adjacencies=now, next_adjacencies=then, weights=radix(local.cardinalities))
+    layout = with_mutexes(with_invariants(layout, local.invariants), local.mutexes)
+    numbers = {int(d): len(layout.factor) + layout.encoding.n_features + i for i, d in enumerate(adjacencies)}
+    numbers |= {int(d): n_features(layout) + len(layout.factor) + i for i, d in enumerate(later)}
+    graphs, synchronic = (_Board(local, layout, numbers).graphs(which) for which in (local.graphs, local.synchronic))
+    variables = [layout.cells[c].ravel() if c < len(cells) else np.asarray([n_factors]) for c in local.synchronic.changing]
+    order = np.concatenate([*variables, np.zeros(0, dtype=np.int64)])
+    return layout, graphs, synchronic._replace(changing=order[layout.mutex_of[order] < 0])
 
 
-def with_laws(layout: Layout, laws: Laws) -> Layout:
+def with_invariants(layout: Layout, invariants: Invariants) -> Layout:
     """The layout with other laws."""
-    return layout._replace(counts=laws.counts, met=laws.met)
+    return layout._replace(counts=invariants.counts, met=invariants.met)
 
 
-def with_couplings(layout: Layout, couplings: Sequence[Coupling]) -> Layout:
+def with_mutexes(layout: Layout, mutexes: Sequence[Mutex]) -> Layout:
     """The layout with its couplings; a cell is in the first that claims it."""
-    of, exactly = layout.coupling_of.copy(), []
+    of, exactly = layout.mutex_of.copy(), []
     groups: list[Ints] = []
     _, height, width = layout.cells.shape
-    for coupling in couplings:
-        if not coupling.lies_on(height, width):
+    for mutex in mutexes:
+        if not mutex.lies_on(height, width):
             continue
-        members = layout.cells[coupling.channel][coupling.cells()].ravel()
+        members = layout.cells[mutex.channel][mutex.cells()].ravel()
         members = members[of[members] < 0]
         if len(members) > 1:
             of[members] = len(groups)
             groups.append(members)
-            exactly.append(coupling.exactly)
-    return coupled_layout(layout, groups, exactly)
+            exactly.append(mutex.exactly)
+    return layout_with_mutexes(layout, groups, exactly)
 
 
 class _Board:
     """Graphs of all cells while they are built. A cell's unit has the number of its factor."""
 
-    def __init__(self, local: LocalGraphs, layout: Layout, meetings: dict[int, int]) -> None:
+    def __init__(self, local: LocalGraphs, layout: Layout, adjacencies: dict[int, int]) -> None:
         self.local, self.layout, self.relative = local, layout, local.graphs
         self.links: list[tuple[int, int, int]] = []
         self.leaves: list[int] = []
-        self.columns: list[list[int]] = local.columns.tolist()
-        self.first_column = np.searchsorted(layout.factor, np.arange(layout.n_factors))
-        self.meetings = meetings
+        self.features: list[list[int]] = local.features.tolist()
+        self.first_feature = np.searchsorted(layout.factor, np.arange(layout.n_factors))
+        self.adjacencies = adjacencies
 
     def graphs(self, graphs: Graphs) -> Graphs:
         """All of them, from those of relative columns."""
         local, layout, self.relative = self.local, self.layout, graphs
         _, height, width = layout.cells.shape
-        pairs = np.concatenate([[0], np.cumsum(layout.acts.n_ways * layout.outputs)]).astype(np.int64)
-        shared = {int(node): self._add(-1, 0, 0, int(node)) for node in np.flatnonzero(graphs.column < 0)}
+        pairs = np.concatenate([[0], np.cumsum(layout.encoding.n_action_classes * layout.outputs)]).astype(np.int64)
+        shared = {int(node): self._add(-1, 0, 0, int(node)) for node in np.flatnonzero(graphs.feature < 0)}
         channel_of = np.full(len(layout.outputs), len(local.cardinalities))
         entries: list[tuple[int, int, int]] = []
         for channel in graphs.changing:
@@ -139,9 +139,9 @@ class _Board:
                 if channel < len(local.cardinalities)
                 else [(layout.n_factors, 0, 0)]
             )
-            for unit, y, x in places:
+            for variable, y, x in places:
                 copies = self._copy(nodes, shared, y, x)
-                entries += self._entries(int(channel), int(pairs[unit]), copies)
+                entries += self._entries(int(channel), int(pairs[variable]), copies)
         for channel in range(len(local.cardinalities)):
             channel_of[layout.cells[channel]] = channel
         channel_of[-1] = len(local.cardinalities) + 1
@@ -153,16 +153,16 @@ class _Board:
             *linked(entries, int(pairs[-1]), self.links),
             np.where(leaves >= 0, graphs.rate[leaves], 0.0),
             np.where(leaves >= 0, graphs.spread[leaves], 0.0),
-            np.concatenate([graphs.stays[graphs.pairs[c] : graphs.pairs[c + 1]] for c in channel_of]),
-            np.concatenate([graphs.novelty[graphs.pairs[c] : graphs.pairs[c + 1]] for c in channel_of]),
+            np.concatenate([graphs.persistence[graphs.pairs[c] : graphs.pairs[c + 1]] for c in channel_of]),
+            np.concatenate([graphs.unseen_mass[graphs.pairs[c] : graphs.pairs[c + 1]] for c in channel_of]),
             np.concatenate([[0], np.cumsum(layout.outputs)]).astype(np.int64),
             np.concatenate([graphs.base[graphs.start[c] : graphs.start[c + 1]] for c in channel_of]),
             graphs.still,
             graphs.noise,
         )
 
-    def _add(self, column: int, off: int, on: int, leaf: int = -1) -> int:
-        self.links.append((column, off, on))
+    def _add(self, feature: int, off: int, on: int, leaf: int = -1) -> int:
+        self.links.append((feature, off, on))
         self.leaves.append(leaf)
         return len(self.links) - 1
 
@@ -174,7 +174,7 @@ class _Board:
         stack = [int(node) for node in graphs.nodes[begin:end]]
         while stack:
             node = stack.pop()
-            if node not in found and graphs.column[node] >= 0:
+            if node not in found and graphs.feature[node] >= 0:
                 found.add(node)
                 stack += [int(graphs.off[node]), int(graphs.on[node])]
         return sorted(found)
@@ -184,28 +184,28 @@ class _Board:
         graphs, copies = self.relative, dict(shared)
         for node in nodes:
             off, on = copies[int(graphs.off[node])], copies[int(graphs.on[node])]
-            column = self._absolute(int(graphs.column[node]), y, x)
-            copies[node] = off if column == _NEVER or off == on else on if column == _ALWAYS else self._add(column, off, on)
+            feature = self._absolute(int(graphs.feature[node]), y, x)
+            copies[node] = off if feature == _NEVER or off == on else on if feature == _ALWAYS else self._add(feature, off, on)
         return copies
 
     def _absolute(self, relative: int, y: int, x: int) -> int:
         """Column of the board that a relative column is at a position."""
         _, height, width = self.layout.cells.shape
-        kind, *parts = self.columns[relative]
+        kind, *parts = self.features[relative]
         if kind == ACTION:
             return len(self.layout.factor) + parts[0]
-        if kind in (MEETING, NEXT_MEETING):
-            return self.meetings[relative]
-        row, column = (y + parts[0], x + parts[1]) if kind == BORDER else (y + parts[2], x + parts[3])
-        inside = 0 <= row < height and 0 <= column < width
+        if kind in (ADJACENCY, NEXT_ADJACENCY):
+            return self.adjacencies[relative]
+        row, col = (y + parts[0], x + parts[1]) if kind == BORDER else (y + parts[2], x + parts[3])
+        inside = 0 <= row < height and 0 <= col < width
         if kind == BORDER:
             return _NEVER if inside else _ALWAYS
         if inside == (kind == WRAP):
             return _NEVER
-        row, column = row % height, column % width
+        row, col = row % height, col % width
         value = parts[1] if self.local.cardinalities[parts[0]] != 2 else 0
-        begin = n_columns(self.layout) if kind == NEXT else 0
-        return int(begin + self.first_column[self.layout.cells[parts[0], row, column]]) + value
+        begin = n_features(self.layout) if kind == NEXT else 0
+        return int(begin + self.first_feature[self.layout.cells[parts[0], row, col]]) + value
 
     def _entries(self, channel: int, begin: int, copies: dict[int, int]) -> list[tuple[int, int, int]]:
         """Entries (pair, value, node) of a unit whose pairs begin at ``begin``."""

@@ -37,7 +37,7 @@ COVERING = 256
 """Systematic draws from which it is estimated how probable it is that all laws are kept."""
 
 
-class Laws(NamedTuple):
+class Invariants(NamedTuple):
     """What every state keeps to.
 
     Attributes:
@@ -54,7 +54,7 @@ class Laws(NamedTuple):
         return len(self.counts) == 0 and len(self.met) == 0
 
 
-LAWLESS = Laws(np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.bool_))
+NO_INVARIANTS = Invariants(np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.bool_))
 
 
 def radix(cardinalities: Sequence[int]) -> Ints:
@@ -73,7 +73,7 @@ def n_combinations(cardinalities: Sequence[int]) -> int:
     return total
 
 
-def find_laws(rows: TransitionBatch, board: PlaneLayout, cardinalities: Sequence[int]) -> Laws:
+def find_invariants(rows: TransitionBatch, board: PlaneLayout, cardinalities: Sequence[int]) -> Invariants:
     """The laws that some transitions keep to.
 
     Args:
@@ -81,7 +81,7 @@ def find_laws(rows: TransitionBatch, board: PlaneLayout, cardinalities: Sequence
         board: where cells lie.
         cardinalities: number of values of each channel's cells.
     """
-    return Laws(_find_counts(rows.select(~rows.terminated), board, cardinalities), _find_met(rows, board, cardinalities))
+    return Invariants(_find_counts(rows.select(~rows.terminated), board, cardinalities), _find_met(rows, board, cardinalities))
 
 
 def _find_counts(rows: TransitionBatch, board: PlaneLayout, cardinalities: Sequence[int]) -> Ints:
@@ -103,7 +103,7 @@ def _find_met(rows: TransitionBatch, board: PlaneLayout, cardinalities: Sequence
     """
     size, weights = n_combinations(cardinalities), radix(cardinalities)
     if size == 0 or len(cardinalities) < 2 or len(rows) == 0:
-        return LAWLESS.met
+        return NO_INVARIANTS.met
     times = np.zeros(size, dtype=np.int64)
     for part in rows.parts(1000):
         planes = board.to_planes(part.after)
@@ -112,7 +112,7 @@ def _find_met(rows: TransitionBatch, board: PlaneLayout, cardinalities: Sequence
         first = np.ones(code.shape, dtype=np.bool_)  # of its kind in this state
         first[:, 1:] = code[:, 1:] != code[:, :-1]
         times += np.bincount(code[first], minlength=size)
-    return times > 0 if (times == 1).sum() <= RARELY_NEW * len(rows) and (times == 0).any() else LAWLESS.met
+    return times > 0 if (times == 1).sum() <= RARELY_NEW * len(rows) and (times == 0).any() else NO_INVARIANTS.met
 
 
 @compiled
@@ -203,21 +203,21 @@ def leave_out_all(
     return left
 
 
-def lawful(laws: Laws, weights: Ints, cells: Ints, states: Ints, found: Successors) -> Successors:
+def enforced(invariants: Invariants, weights: Ints, cells: Ints, states: Ints, found: Successors) -> Successors:
     """Successors of states [B, F] without those that break a law."""
-    if laws.none or len(states) == 0:
+    if invariants.none or len(states) == 0:
         return found
     following, over, chances = found.states.copy(), found.terminated.copy(), found.probabilities.copy()
-    left = leave_out_all(*laws, weights, cells, states, found.offsets, following, over, chances)
+    left = leave_out_all(*invariants, weights, cells, states, found.offsets, following, over, chances)
     sizes = np.diff(found.offsets)
     kept = np.arange(len(over)) - np.repeat(found.offsets[:-1], sizes) < np.repeat(left, sizes)
     offsets = np.concatenate([[0], np.cumsum(left)]).astype(np.int64)
     return Successors(offsets, following[kept], over[kept], chances[kept])
 
 
-def kept_chances(laws: Laws, weights: Ints, cells: Ints, states: Ints, found: Successors) -> Floats:
+def kept_chances(invariants: Invariants, weights: Ints, cells: Ints, states: Ints, found: Successors) -> Floats:
     """Probability that an outcome that goes on keeps all laws, for each row of successors; 1 where none does, or none goes on."""
     rows, on = found.rows, ~found.terminated
-    kept = all_kept(*laws, weights, cells, states[rows], found.states)
+    kept = all_kept(*invariants, weights, cells, states[rows], found.states)
     total, good = (np.bincount(rows, weights=found.probabilities * which, minlength=len(states)) for which in (on, on & kept))
     return np.where(good > 0.0, good / np.where(total > 0.0, total, 1.0), 1.0)

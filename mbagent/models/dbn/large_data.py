@@ -15,24 +15,24 @@ from numpy.typing import NDArray
 
 from mbagent.data import Factors, TransitionBatch
 from mbagent.models.dbn.arrays import Graphs, build
-from mbagent.models.dbn.features import Acts, Layout, Question, Seen, ask, distinct, lay_out
+from mbagent.models.dbn.features import ActionEncoding, Layout, Observed, Question, ask, distinct, make_layout
 from mbagent.models.dbn.plane_features import (
     ACTION,
+    ADJACENCY,
     BORDER,
     CELL,
-    MEETING,
-    NEXT_MEETING,
+    NEXT_ADJACENCY,
     WRAP,
-    column_kinds,
-    column_planes,
-    column_values,
+    determined_by,
     far_value,
-    known_columns,
-    told_by,
+    feature_kinds,
+    feature_planes,
+    feature_values,
+    informative_features,
     values_at,
 )
-from mbagent.models.dbn.score import Head, Tables, columns_of, evidence_tables, evidences
-from mbagent.models.dbn.smoothing import habit_of
+from mbagent.models.dbn.score import Tables, Target, evidence_tables, evidences, feature_blocks
+from mbagent.models.dbn.smoothing import smoothing_of
 from mbagent.models.dbn.split_search import certainty, find_splits, go_on
 from mbagent.models.dbn.splits import Search, Split
 from mbagent.spaces import PlaneLayout
@@ -55,9 +55,9 @@ CHUNK = 50_000_000
 """Entries of the table that are made at once."""
 
 
-def channel_layout(cardinalities: Sequence[int], acts: Acts) -> Layout:
+def channel_layout(cardinalities: Sequence[int], encoding: ActionEncoding) -> Layout:
     """Channels as the factors of a layout; its own columns mean nothing."""
-    return lay_out(cardinalities, (), acts, ordinal=False)
+    return make_layout(cardinalities, (), encoding, ordinal=False)
 
 
 def _counted(rows: TransitionBatch) -> tuple[TransitionBatch, Ints]:
@@ -75,15 +75,15 @@ class PlaneTable:
     Attributes:
         table: columns of the neighbourhood of all cells that look different, bool [looks, near].
         whole: whether it is of all transitions.
-        most_looks: rows that a table for a search may have.
+        most_patterns: rows that a table for a search may have.
         every: planes of all transitions and of their next states; of evenly chosen ones where that were over MOST_COUNTED.
 
     Args:
         rows: N transitions.
         board: where cells lie.
         cardinalities: number of values of each channel's cells, length C.
-        columns: all relative columns, int64 [D, 7].
-        acts: the actions.
+        features: all relative columns, int64 [D, 7].
+        encoding: the actions.
         since: first row that counts for each channel and for ``terminated``, int64 [C + 1]; None for all.
         in_pairs: whether to look for causes that matter only together, which takes most of the time.
     """
@@ -93,80 +93,80 @@ class PlaneTable:
         rows: TransitionBatch,
         board: PlaneLayout,
         cardinalities: tuple[int, ...],
-        columns: Ints,
-        acts: Acts,
+        features: Ints,
+        encoding: ActionEncoding,
         since: Ints | None = None,
         in_pairs: bool = True,
     ) -> None:
         """See the class."""
         self.in_pairs = in_pairs
-        self.board, self.cardinalities, self.columns, self.acts = board, cardinalities, columns, acts
+        self.board, self.cardinalities, self.features, self.encoding = board, cardinalities, features, encoding
         self.n_cells = board.height * board.width
         self.since = np.zeros(len(cardinalities) + 1, dtype=np.int64) if since is None else since
         rows, counted = _counted(rows)
         self.since = np.searchsorted(counted, self.since)
         self.every = board.to_planes(rows.before), board.to_planes(rows.after)
         self.every_action, self.every_since = rows.actions, self.since
-        known = known_columns(columns, *self.every)
-        kind = columns[known, 0]
-        here = np.isin(kind, (CELL, BORDER, ACTION, WRAP)) | ((kind == MEETING) & (columns[known, 5:] == 0).all(axis=1))
+        known = informative_features(features, *self.every)
+        kind = features[known, 0]
+        here = np.isin(kind, (CELL, BORDER, ACTION, WRAP)) | ((kind == ADJACENCY) & (features[known, 5:] == 0).all(axis=1))
         self.near, self.far, self.next_far = (
-            known[which] for which in (here, np.isin(kind, (MEETING, ACTION)), kind == NEXT_MEETING)
+            known[which] for which in (here, np.isin(kind, (ADJACENCY, ACTION)), kind == NEXT_ADJACENCY)
         )
-        self.most_looks = (MOST_CELLS if in_pairs else QUICK_CELLS) // max(len(self.near), 1)
-        self.table, self.pattern, taken = self._looks(self.every[0], rows.actions)
+        self.most_patterns = (MOST_CELLS if in_pairs else QUICK_CELLS) // max(len(self.near), 1)
+        self.table, self.pattern, taken = self._patterns(self.every[0], rows.actions)
         self.whole = len(taken) == len(rows)
         self.rows = rows if self.whole else rows.select(taken)
         self.before, self.after = board.to_planes(self.rows.before), board.to_planes(self.rows.after)
         self.since = np.searchsorted(taken, self.since)
-        self.actions = np.repeat(acts.way[self.rows.actions], self.n_cells)
+        self.actions = np.repeat(encoding.action_class[self.rows.actions], self.n_cells)
 
-    def _looks(self, planes: Factors, actions: Ints) -> tuple[Bools, Ints, Ints]:
+    def _patterns(self, planes: Factors, actions: Ints) -> tuple[Bools, Ints, Ints]:
         """Columns of all cells that look different, which each cell looks like, and which transitions that is of.
 
         Transitions from all over are taken as long as there is room.
         """
-        most, step = self.most_looks, max(1, CHUNK // (self.n_cells * max(len(self.near), 1)))
-        looks, n_parts = np.zeros((0, -(-len(self.near) // 8)), dtype=np.uint8), -(-len(planes) // step)
+        most, step = self.most_patterns, max(1, CHUNK // (self.n_cells * max(len(self.near), 1)))
+        patterns_seen, n_parts = np.zeros((0, -(-len(self.near) // 8)), dtype=np.uint8), -(-len(planes) // step)
         pattern, taken = [np.zeros((0, self.n_cells), dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
         for number in range(n_parts):
-            if len(looks) >= most:
+            if len(patterns_seen) >= most:
                 break
             part = np.arange(number, len(planes), n_parts)
-            packed = np.packbits(column_values(self.columns[self.near], planes[part], actions[part]), axis=1)
+            packed = np.packbits(feature_values(self.features[self.near], planes[part], actions[part]), axis=1)
             first, of = distinct(packed)
-            both, known = np.concatenate([looks, packed[first]]), len(looks)
+            both, known = np.concatenate([patterns_seen, packed[first]]), len(patterns_seen)
             kept, now = distinct(both)
             renamed = np.argsort(np.argsort(kept, kind="stable"), kind="stable")[now]  # looks known before keep their numbers
-            looks = both[np.sort(kept)]
+            patterns_seen = both[np.sort(kept)]
             pattern.append(renamed[known:][of].reshape(len(part), self.n_cells))
             taken.append(part)
         rows = np.concatenate(taken)
         order = np.argsort(rows)
-        table = np.unpackbits(looks, axis=1, count=len(self.near)).astype(np.bool_)
+        table = np.unpackbits(patterns_seen, axis=1, count=len(self.near)).astype(np.bool_)
         return table, np.concatenate(pattern)[order].ravel(), rows[order]
 
-    def seen(self, channel: int) -> Seen:
+    def observed(self, channel: int) -> Observed:
         """A channel's values in all cells; looks are rows of ``table``."""
         now, then = (planes[:, channel].reshape(-1).astype(np.int64) for planes in (self.before, self.after))
-        return Seen(self.pattern, self.actions, now, then).select(self.cells_since(channel))
+        return Observed(self.pattern, self.actions, now, then).select(self.cells_since(channel))
 
-    def told_by(self, channel: int) -> Ints | None:
-        """Columns that alone tell what a channel becomes, see ``windows.told_by``; None where none do, or it changed rarely."""
+    def determined_by(self, channel: int) -> Ints | None:
+        """Columns that alone tell what a channel becomes, see ``windows.determined_by``; None where none do, or it changed rarely."""
         before, after = (planes[:, channel] for planes in self.every)
         if (before != after).sum() < FEWEST_CHANGES:
             return None
-        return told_by(channel, self.columns, self.near, *self.every, self.every_action)
+        return determined_by(channel, self.features, self.near, *self.every, self.every_action)
 
-    def copying(self, channel: int, columns: Ints) -> tuple[list[Question], Bools]:
+    def copying(self, channel: int, features: Ints) -> tuple[list[Question], Bools]:
         """The questions about a channel that some columns alone tell all of, with the table of those columns."""
-        seen, cardinality = self.seen(channel), self.cardinalities[channel]
-        told = column_values(self.columns[columns], self.before, self.rows.actions)[self.cells_since(channel)]
-        value = np.concatenate([told, np.ones((len(told), 1), dtype=np.bool_)], axis=1).argmax(axis=1)
-        look = (seen.actions * cardinality + seen.now) * (len(columns) + 1) + value
-        first = np.full(self.acts.n_ways * cardinality * (len(columns) + 1), -1)
+        observed, cardinality = self.observed(channel), self.cardinalities[channel]
+        determined = feature_values(self.features[features], self.before, self.rows.actions)[self.cells_since(channel)]
+        value = np.concatenate([determined, np.ones((len(determined), 1), dtype=np.bool_)], axis=1).argmax(axis=1)
+        look = (observed.actions * cardinality + observed.now) * (len(features) + 1) + value
+        first = np.full(self.encoding.n_action_classes * cardinality * (len(features) + 1), -1)
         first[look[::-1]] = np.arange(len(look))[::-1]
-        return ask(channel, cardinality, replace(seen, pattern=look)), told[first]
+        return ask(channel, cardinality, replace(observed, pattern=look)), determined[first]
 
     def cells_since(self, channel: int) -> Ints:
         """Numbers of the cells that count for a channel."""
@@ -174,23 +174,29 @@ class PlaneTable:
 
     def far_values(self, numbers: Ints) -> Bools:
         """Columns that are the same at all positions, bool [N, len(numbers)]."""
-        found = [far_value(self.columns[d], self.before, self.rows.actions, self.after) for d in numbers]
+        found = [far_value(self.features[d], self.before, self.rows.actions, self.after) for d in numbers]
         return np.stack(found, axis=1)
 
     def split(self, asked: Sequence[Question], table: Bools, numbers: Ints) -> list[Search]:
         """Splits by columns of a table, which have these numbers among the relative ones."""
-        kinds = column_kinds(self.columns)[numbers]
-        found = find_splits([q.head for q in asked], table, kinds, self.acts.n_ways, self.in_pairs)
+        kinds = feature_kinds(self.features)[numbers]
+        found = find_splits([q.target for q in asked], table, kinds, self.encoding.n_action_classes, self.in_pairs)
         return [search.renamed(numbers) for search in found]
 
     def build(self, asked: Sequence[Question], found: Sequence[Search]) -> Graphs:
         """Graphs of channels, ``terminated`` and the event that never happens."""
-        seen = [self.seen(channel) for channel in range(len(self.cardinalities))]
-        habits = [habit_of(k, self.acts.n_ways, s.actions, s.now, s.then) for k, s in zip(self.cardinalities, seen, strict=True)]
+        observed = [self.observed(channel) for channel in range(len(self.cardinalities))]
+        smoothings = [
+            smoothing_of(k, self.encoding.n_action_classes, s.actions, s.now, s.then)
+            for k, s in zip(self.cardinalities, observed, strict=True)
+        ]
         nothing, ends = np.zeros(len(self.rows), dtype=np.int64), self.rows.terminated.astype(np.int64)
-        habits += [habit_of(2, self.acts.n_ways, self.acts.way[self.rows.actions], nothing, then) for then in (ends, nothing)]
+        smoothings += [
+            smoothing_of(2, self.encoding.n_action_classes, self.encoding.action_class[self.rows.actions], nothing, then)
+            for then in (ends, nothing)
+        ]
         still = 0.5 / (len(self.actions) * len(self.cardinalities) + 1.0)
-        return build(channel_layout(self.cardinalities, self.acts), asked, found, habits, still)
+        return build(channel_layout(self.cardinalities, self.encoding), asked, found, smoothings, still)
 
 
 ROUNDS = 6
@@ -204,7 +210,7 @@ LEAST = 300
 """Cells of the more frequent outcome that are taken at least."""
 
 
-def zoom(planes: PlaneTable, asked: Sequence[Question], found: list[Search]) -> list[Search]:
+def refine(planes: PlaneTable, asked: Sequence[Question], found: list[Search]) -> list[Search]:
     """Searches that go on in all transitions where some were searched; as they are where all were.
 
     Args:
@@ -218,7 +224,7 @@ def zoom(planes: PlaneTable, asked: Sequence[Question], found: list[Search]) -> 
     if planes.whole or not asked:
         return found
     followed = [_Followed(planes, question, search) for question, search in zip(asked, found, strict=True)]
-    most, certain = planes.most_looks, certainty(found)
+    most, certain = planes.most_patterns, certainty(found)
     for _ in range(ROUNDS):
         if not _round(planes, followed, most, certain):
             break
@@ -232,24 +238,24 @@ class _Followed:
         splits: all splits so far.
         context: of each cell, int32 [N * P]; -1 where it is not asked.
         n, e: cells and arrivals of each context, int64 [C].
-        action, value, typical: of each context, see ``Head`` and ``Search``.
+        action, value, prior_mean: of each context, see ``Target`` and ``Search``.
         closed: contexts in which nothing more was found, bool [C].
     """
 
     def __init__(self, planes: PlaneTable, question: Question, search: Search) -> None:
-        self.planes, self.question, self.channel = planes, question, question.unit
+        self.planes, self.question, self.channel = planes, question, question.variable
         self.splits: list[Split] = []
         cardinality = planes.cardinalities[self.channel]
-        context = np.full(planes.acts.n_ways * cardinality, -1, dtype=np.int32)
+        context = np.full(planes.encoding.n_action_classes * cardinality, -1, dtype=np.int32)
         context[question.pairs] = np.arange(len(question.pairs))
         now = planes.every[0][:, self.channel].reshape(len(planes.every_action), -1)
-        self.context = context[(planes.acts.way[planes.every_action] * cardinality)[:, None] + now].ravel()
+        self.context = context[(planes.encoding.action_class[planes.every_action] * cardinality)[:, None] + now].ravel()
         self.context[: planes.every_since[self.channel] * planes.n_cells] = -1
-        self.action, self.value, self.typical = search.head.action, search.head.value, search.typical
+        self.action, self.value, self.prior_mean = search.target.action, search.target.value, search.prior_mean
         self.closed = np.zeros(len(self.action), dtype=np.bool_)
         self.follow(search.splits)
 
-    def came(self) -> Bools:
+    def positives(self) -> Bools:
         """In which cells the value came, bool [N * P]."""
         result: Bools = (self.planes.every[1][:, self.channel] == self.question.values[0]).ravel()
         return result
@@ -257,26 +263,26 @@ class _Followed:
     def follow(self, splits: Sequence[Split]) -> None:
         """Takes all cells through further splits, and counts them."""
         planes = self.planes
-        used = np.unique([split.column for split in splits if split.column >= 0]).astype(np.int64)
-        which = np.asarray([np.searchsorted(used, s.column) if s.column >= 0 else -1 for s in splits], dtype=np.int64)
+        used = np.unique([split.feature for split in splits if split.feature >= 0]).astype(np.int64)
+        which = np.asarray([np.searchsorted(used, s.feature) if s.feature >= 0 else -1 for s in splits], dtype=np.int64)
         targets = np.concatenate([np.zeros((2, 0), dtype=np.int64), *(np.stack([s.off, s.on]) for s in splits)], axis=1)
         first = np.concatenate([[0], np.cumsum([len(s.off) for s in splits])]).astype(np.int64)
         step = max(1, CHUNK // (planes.n_cells * (len(used) + 1)))
         for begin in range(0, len(planes.every_action), step):
             part = slice(begin, begin + step)
-            values = column_planes(planes.columns[used], planes.every[0][part], planes.every_action[part])
+            values = feature_planes(planes.features[used], planes.every[0][part], planes.every_action[part])
             cells = self.context[begin * planes.n_cells : (begin + step) * planes.n_cells]
             _walk(values.reshape(len(used), len(cells)), which, first, targets, cells)
         self.splits += splits
         asked, size = self.context >= 0, len(self.action)
         self.n = np.bincount(self.context[asked], minlength=size)
-        self.e = np.bincount(self.context[asked & self.came()], minlength=size)
+        self.e = np.bincount(self.context[asked & self.positives()], minlength=size)
 
     def search(self) -> Search:
         """The splits, with counts for rows."""
         contexts = np.arange(len(self.action))
-        search = Search(Head(contexts, self.n, self.e, contexts, self.action, self.value))
-        search.splits, search.typical = self.splits, self.typical
+        search = Search(Target(contexts, self.n, self.e, contexts, self.action, self.value))
+        search.splits, search.prior_mean = self.splits, self.prior_mean
         return search
 
     def open_contexts(self, tables: Tables) -> Bools:
@@ -297,18 +303,18 @@ class _Followed:
             if not search.splits:
                 self.closed[context] = True
                 continue
-            size, head = len(self.action), search.head
+            size, target = len(self.action), search.target
             kept = np.delete(np.arange(size), context)
             order = np.empty(size, dtype=np.int64)
             order[kept], order[context] = np.arange(size - 1), size - 1
             splits.append(Split(-1, order, order, 0.0))
             for split in search.splits:
                 off, on = (np.concatenate([np.arange(size - 1), size - 1 + side]) for side in (split.off, split.on))
-                splits.append(Split(int(near[split.column]) if split.column >= 0 else -1, off, on, split.gain))
-            self.action = np.concatenate([self.action[kept], head.action])
-            self.value = np.concatenate([self.value[kept], head.value])
-            self.typical = np.concatenate([self.typical[kept], np.full(len(head.action), rates[context])])
-            self.closed = np.concatenate([self.closed[kept], np.zeros(len(head.action), dtype=np.bool_)])
+                splits.append(Split(int(near[split.feature]) if split.feature >= 0 else -1, off, on, split.gain))
+            self.action = np.concatenate([self.action[kept], target.action])
+            self.value = np.concatenate([self.value[kept], target.value])
+            self.prior_mean = np.concatenate([self.prior_mean[kept], np.full(len(target.action), rates[context])])
+            self.closed = np.concatenate([self.closed[kept], np.zeros(len(target.action), dtype=np.bool_)])
         if splits:
             self.follow(splits)
         return bool(splits)
@@ -328,10 +334,10 @@ def _round(planes: PlaneTable, followed: Sequence[_Followed], most: int, certain
         return False
     rows, cells = np.divmod(np.concatenate(chosen), planes.n_cells)
     width = planes.board.width
-    table = values_at(planes.columns[planes.near], planes.every[0], planes.every_action, rows, cells // width, cells % width)
-    kinds = column_kinds(planes.columns)[planes.near]
+    table = values_at(planes.features[planes.near], planes.every[0], planes.every_action, rows, cells // width, cells % width)
+    kinds = feature_kinds(planes.features)[planes.near]
     tables = evidence_tables(len(table) + 1, certain)
-    go_on(every, table, columns_of(table), kinds, planes.acts.n_ways, tables, planes.in_pairs)
+    go_on(every, table, feature_blocks(table), kinds, planes.encoding.n_action_classes, tables, planes.in_pairs)
     grown = [each.graft(some, contexts, planes.near) for each, some, contexts in zip(followed, searches, opened, strict=True)]
     return any(grown)
 
@@ -356,7 +362,7 @@ def _sampled(each: _Followed, contexts: Ints, limit: int, chosen: list[Ints]) ->
     number = np.full(len(each.action) + 1, -1, dtype=np.int32)  # the last one: of cells that are not asked
     number[contexts] = np.arange(len(contexts))
     inside = np.flatnonzero(number[each.context] >= 0)
-    group = 2 * number[each.context[inside]] + each.came()[inside]
+    group = 2 * number[each.context[inside]] + each.positives()[inside]
     order = np.argsort(group, kind="stable")
     ends = np.searchsorted(group[order], np.arange(2 * len(contexts) + 1))
     begun, searches = sum(len(cells) for cells in chosen), []
@@ -366,11 +372,11 @@ def _sampled(each: _Followed, contexts: Ints, limit: int, chosen: list[Ints]) ->
         sizes = [min(len(o), 3 * rarer + LEAST if len(o) == max(map(len, outcomes)) else rarer) for o in outcomes]
         taken = [o[np.linspace(0, len(o) - 1, n).astype(np.int64)] for o, n in zip(outcomes, sizes, strict=True)]
         chosen += taken
-        rows, came = begun + np.arange(sum(sizes)), np.repeat([0, 1], sizes)
+        rows, positives = begun + np.arange(sum(sizes)), np.repeat([0, 1], sizes)
         begun += sum(sizes)
         start = np.zeros(len(rows), dtype=np.int64)
         own = slice(int(context), int(context) + 1)
-        searches.append(Search(Head(rows, start + 1, came, start, each.action[own], each.value[own])))
+        searches.append(Search(Target(rows, start + 1, positives, start, each.action[own], each.value[own])))
     return searches
 
 

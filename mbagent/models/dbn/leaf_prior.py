@@ -51,22 +51,22 @@ class LeafPrior:
     certain: float
     strength: float
 
-    def evidence(self, n: Ints, e: Ints, typical: Floats) -> tuple[Floats, Floats]:
+    def evidence(self, n: Ints, e: Ints, prior_mean: Floats) -> tuple[Floats, Floats]:
         """Log-probability of ``e`` of ``n`` rows, in their order, and the posterior probability of the slab."""
-        return _with_spike(self._slab(n, e, typical)[0], self.certain, n, e, typical)
+        return _with_spike(self._slab(n, e, prior_mean)[0], self.certain, n, e, prior_mean)
 
-    def rates(self, n: Ints, e: Ints, typical: Floats) -> Floats:
+    def rates(self, n: Ints, e: Ints, prior_mean: Floats) -> Floats:
         """Posterior mean rate."""
-        typical = typical.clip(SURE, 1.0 - SURE)
-        rows, mean = self._slab(n, e, typical)
-        _, slab = _with_spike(rows, self.certain, n, e, typical)
-        spike = np.where(n == 0, typical, (e == n) * 1.0)
+        prior_mean = prior_mean.clip(SURE, 1.0 - SURE)
+        rows, mean = self._slab(n, e, prior_mean)
+        _, slab = _with_spike(rows, self.certain, n, e, prior_mean)
+        spike = np.where(n == 0, prior_mean, (e == n) * 1.0)
         result: Floats = slab * mean + (1.0 - slab) * spike
         return result
 
-    def _slab(self, n: Ints, e: Ints, typical: Floats) -> tuple[Floats, Floats]:
+    def _slab(self, n: Ints, e: Ints, prior_mean: Floats) -> tuple[Floats, Floats]:
         """Log-probability of the rows and their mean rate where something is random."""
-        up, down = self.strength * typical, self.strength * (1.0 - typical)
+        up, down = self.strength * prior_mean, self.strength * (1.0 - prior_mean)
         return special.betaln(up + e, down + n - e) - special.betaln(up, down), (e + up) / (n + self.strength)
 
 
@@ -83,12 +83,12 @@ class MixedPrior(LeafPrior):
 
     weights: Floats
 
-    def _slab(self, n: Ints, e: Ints, typical: Floats) -> tuple[Floats, Floats]:
-        before = special.logsumexp(_likelihoods(0 * n, 0 * e, typical, self.strength), axis=1, b=self.weights)
-        after = _likelihoods(n, e, typical, self.strength) + np.log(self.weights)
+    def _slab(self, n: Ints, e: Ints, prior_mean: Floats) -> tuple[Floats, Floats]:
+        before = special.logsumexp(_likelihoods(0 * n, 0 * e, prior_mean, self.strength), axis=1, b=self.weights)
+        after = _likelihoods(n, e, prior_mean, self.strength) + np.log(self.weights)
         total = special.logsumexp(after, axis=1)
-        seen = (n + self.strength)[:, None]
-        means = (UP + e[:, None] + self.strength * typical[:, None]) / (UP + DOWN + seen)
+        counted = (n + self.strength)[:, None]
+        means = (UP + e[:, None] + self.strength * prior_mean[:, None]) / (UP + DOWN + counted)
         return total - before, (np.exp(after - total[:, None]) * means).sum(axis=1)
 
 
@@ -99,12 +99,12 @@ def best_prior(searches: Sequence[Search]) -> LeafPrior:
 
 def fitted_prior(searches: Sequence[Search]) -> LeafPrior:
     """As ``best_prior``; a mixture fitted to the leaves where they clearly are likelier then."""
-    n, e, typical = _leaves(searches)
-    simple, met = _best_of(PRIORS, n, e, typical), np.flatnonzero(n)
+    n, e, prior_mean = _leaves(searches)
+    simple, met = _best_of(PRIORS, n, e, prior_mean), np.flatnonzero(n)
     if len(met) == 0:
         return simple
     some = met[np.linspace(0, len(met) - 1, min(len(met), MOST_LEAVES)).astype(np.int64)]
-    leaves = n[some], e[some], typical[some]
+    leaves = n[some], e[some], prior_mean[some]
     mixed = _mixture(simple.certain, *leaves)
     gain = float((mixed.evidence(*leaves)[0] - simple.evidence(*leaves)[0]).sum())
     return mixed if gain > WORTHWHILE else simple
@@ -115,37 +115,37 @@ def _leaves(searches: Sequence[Search]) -> tuple[Ints, Ints, Floats]:
     counts = [search.counts() for search in searches]
     nothing = np.zeros(0, dtype=np.int64)
     n, e = (np.concatenate([nothing, *(pair[i] for pair in counts)]) for i in (0, 1))
-    return n, e, np.concatenate([np.zeros(0), *(search.typical for search in searches)]).clip(SURE, 1.0 - SURE)
+    return n, e, np.concatenate([np.zeros(0), *(search.prior_mean for search in searches)]).clip(SURE, 1.0 - SURE)
 
 
-def _best_of(priors: Sequence[LeafPrior], n: Ints, e: Ints, typical: Floats) -> LeafPrior:
-    return max(priors, key=lambda prior: float(prior.evidence(n, e, typical)[0].sum()))
+def _best_of(priors: Sequence[LeafPrior], n: Ints, e: Ints, prior_mean: Floats) -> LeafPrior:
+    return max(priors, key=lambda prior: float(prior.evidence(n, e, prior_mean)[0].sum()))
 
 
-def _with_spike(slab: Floats, certain: float, n: Ints, e: Ints, typical: Floats) -> tuple[Floats, Floats]:
+def _with_spike(slab: Floats, certain: float, n: Ints, e: Ints, prior_mean: Floats) -> tuple[Floats, Floats]:
     """Evidence of leaves whose evidence is ``slab`` if anything is random, and the posterior probability that it is."""
     slab = slab + np.log1p(-certain)
     with np.errstate(divide="ignore"):
-        spike = np.log(certain * ((e == 0) * (1.0 - typical) + (e == n) * typical))
+        spike = np.log(certain * ((e == 0) * (1.0 - prior_mean) + (e == n) * prior_mean))
     total = np.logaddexp(slab, spike)
     return total, np.exp(slab - total)
 
 
-def _likelihoods(n: Ints, e: Ints, typical: Floats, strength: float) -> Floats:
+def _likelihoods(n: Ints, e: Ints, prior_mean: Floats, strength: float) -> Floats:
     """Log-probability [N, K] of the leaves' rows, and of what the typical rate counts for, under each component."""
-    up, down = e + strength * typical, n - e + strength * (1.0 - typical)
+    up, down = e + strength * prior_mean, n - e + strength * (1.0 - prior_mean)
     result: Floats = special.betaln(UP + up[:, None], DOWN + down[:, None]) - special.betaln(UP, DOWN)
     return result
 
 
-def _mixture(certain: float, n: Ints, e: Ints, typical: Floats) -> MixedPrior:
+def _mixture(certain: float, n: Ints, e: Ints, prior_mean: Floats) -> MixedPrior:
     """The mixture under which leaves are likeliest, by expectation and maximisation from a simple prior on."""
-    rows, before = (_likelihoods(k * n, k * e, typical, MIXED_STRENGTH) for k in (1, 0))
+    rows, before = (_likelihoods(k * n, k * e, prior_mean, MIXED_STRENGTH) for k in (1, 0))
     top = rows.max(axis=1)
     rows, before, weights = np.exp(rows - top[:, None]), np.exp(before), np.full(len(CENTRES), 1.0 / len(CENTRES))
     for _ in range(ROUNDS):
         after, given = rows @ weights, before @ weights
-        slab = _with_spike(np.log(after / given) + top, certain, n, e, typical)[1]
+        slab = _with_spike(np.log(after / given) + top, certain, n, e, prior_mean)[1]
         weights *= ((slab / after) @ rows) / np.maximum((slab / given) @ before, LEAST)
         weights = np.maximum(weights / weights.sum(), LEAST)
         certain = float(1.0 - slab.mean().clip(LEAST, 1.0 - LEAST))

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 
 from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.models.base import FitReport
-from mbagent.models.dbn.arrays import Graphs, build, n_columns
-from mbagent.models.dbn.change_points import still_true_since
-from mbagent.models.dbn.effects import Asking, Partner, best_askings, candidates, likely_partners, more_folds
-from mbagent.models.dbn.features import Layout, acts_of, coupled_layout, is_lone_bit, lay_out
-from mbagent.models.dbn.fitting import AT_ONCE, Fitted, fit_graphs, flag_events, nothing_late
+from mbagent.models.dbn.arrays import Graphs, build, n_features
+from mbagent.models.dbn.change_points import last_changes
+from mbagent.models.dbn.effects import EffectModel, Operand, best_effect_models, candidates, likely_operands, more_folds
+from mbagent.models.dbn.features import Layout, action_encoding, is_lone_bit, layout_with_mutexes, make_layout
+from mbagent.models.dbn.fitting import AT_ONCE, Fitted, fit_graphs, flag_resets, no_synchronic
 from mbagent.models.dbn.mutex import find_groups
 from mbagent.models.dbn.predictions import GraphPredictions
 from mbagent.models.dbn.serialization import SAVED, from_arrays, table_of, to_arrays
-from mbagent.models.dbn.smoothing import habit_of
+from mbagent.models.dbn.smoothing import smoothing_of
 from mbagent.models.fit_report import Variable, VariableReport, describe
 from mbagent.models.held_out import FORETOLD, SOME_ROWS, SOME_TESTS, better, thinned, within
 from mbagent.models.markov_test import steps_in_a_row, with_past
@@ -29,48 +29,52 @@ from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.types import Bools, Floats
 
 
-def asked_columns(graphs: Graphs, unit: int) -> set[int]:
+def tested_features(graphs: Graphs, variable: int) -> set[int]:
     """Columns that the graphs of a unit ask for."""
-    if unit not in graphs.changing:
+    if variable not in graphs.changing:
         return set()
-    begin, end = graphs.entries[graphs.pairs[unit]], graphs.entries[graphs.pairs[unit + 1]]
-    stack, seen = [int(node) for node in graphs.nodes[begin:end]], set()
+    begin, end = graphs.entries[graphs.pairs[variable]], graphs.entries[graphs.pairs[variable + 1]]
+    stack, observed = [int(node) for node in graphs.nodes[begin:end]], set()
     while stack:
         node = stack.pop()
-        if node not in seen:
-            seen.add(node)
-            if graphs.column[node] >= 0:
+        if node not in observed:
+            observed.add(node)
+            if graphs.feature[node] >= 0:
                 stack += [int(graphs.off[node]), int(graphs.on[node])]
-    return {int(graphs.column[node]) for node in seen if graphs.column[node] >= 0}
+    return {int(graphs.feature[node]) for node in observed if graphs.feature[node] >= 0}
 
 
-def hangs_on_action(graphs: Graphs, unit: int, layout: Layout) -> bool:
+def depends_on_action(graphs: Graphs, variable: int, layout: Layout) -> bool:
     """Whether what a unit does differs from action to action."""
-    n, first = int(layout.outputs[unit]), int(graphs.pairs[unit])
+    n, first = int(layout.outputs[variable]), int(graphs.pairs[variable])
 
-    def ways(pair: int) -> list[tuple[int, int]]:
+    def action_classes(pair: int) -> list[tuple[int, int]]:
         entries = range(graphs.entries[first + pair], graphs.entries[first + pair + 1])
         return [(int(graphs.values[e]), int(graphs.nodes[e])) for e in entries]
 
-    return any(ways(way * n + value) != ways(value) for value in range(n) for way in range(1, layout.acts.n_ways))
+    return any(
+        action_classes(action_class * n + value) != action_classes(value)
+        for value in range(n)
+        for action_class in range(1, layout.encoding.n_action_classes)
+    )
 
 
-def parent_factors(layout: Layout, columns: set[int]) -> set[int]:
+def parent_factors(layout: Layout, features: set[int]) -> set[int]:
     """Factors that state columns are about; those of the next state are left out."""
-    return {int(layout.factor[column]) for column in columns if column < len(layout.factor)}
+    return {int(layout.factor[feature]) for feature in features if feature < len(layout.factor)}
 
 
-def flat_variables(layout: Layout, graphs: Graphs, late: Graphs) -> list[Variable]:
+def flat_variables(layout: Layout, graphs: Graphs, synchronic: Graphs) -> list[Variable]:
     """Factors and groups that have graphs, and what they hang on besides themselves."""
-    n, after, found = len(layout.factor), len(layout.factor) + layout.acts.n_columns, []
-    for unit in graphs.changing[graphs.changing < len(layout.outputs) - 2]:
-        factors = tuple(int(f) for f in layout.members[layout.first[unit] : layout.first[unit + 1]])
+    n, after, found = len(layout.factor), len(layout.factor) + layout.encoding.n_features, []
+    for variable in graphs.changing[graphs.changing < len(layout.outputs) - 2]:
+        factors = tuple(int(f) for f in layout.members[layout.first[variable] : layout.first[variable + 1]])
         name = f"factor {factors[0]}" if len(factors) == 1 else f"factors {factors[0]}, {factors[1]}, …"
-        columns = asked_columns(graphs, int(unit)) | asked_columns(late, int(unit))
-        parents = [f"factor {f}" for f in sorted(parent_factors(layout, columns) - set(factors))]
-        if hangs_on_action(graphs, int(unit), layout) or any(n <= column < after for column in columns):
+        features = tested_features(graphs, int(variable)) | tested_features(synchronic, int(variable))
+        parents = [f"factor {f}" for f in sorted(parent_factors(layout, features) - set(factors))]
+        if depends_on_action(graphs, int(variable), layout) or any(n <= feature < after for feature in features):
             parents.insert(0, "action")
-        later = {int(layout.factor[column - after]) for column in columns if column >= after}
+        later = {int(layout.factor[feature - after]) for feature in features if feature >= after}
         found.append(Variable(name, factors, (*parents, *(f"next factor {f}" for f in sorted(later)))))
     return found
 
@@ -125,55 +129,57 @@ class DecisionGraphModel(GraphPredictions):
         self.validation, self.parts = validation, (n_actions,) if parts is None else tuple(parts)
         if math.prod(self.parts) != n_actions:
             raise ValueError(f"Actions with {self.parts} values of their parts are {math.prod(self.parts)}, not {n_actions}.")
-        self.acts = acts_of(self.parts)
-        layout = lay_out(self.cardinalities, (), self.acts)
+        self.encoding = action_encoding(self.parts)
+        layout = make_layout(self.cardinalities, (), self.encoding)
         none = np.zeros(0, dtype=np.int64)
-        nothing = build(layout, (), (), [habit_of(int(n), self.acts.n_ways, none, none, none) for n in layout.outputs], 1e-9)
-        self.fitted = Fitted(layout, nothing, nothing_late(nothing), nothing, False, (), ())
+        nothing = build(
+            layout, (), (), [smoothing_of(int(n), self.encoding.n_action_classes, none, none, none) for n in layout.outputs], 1e-9
+        )
+        self.fitted = Fitted(layout, nothing, no_synchronic(nothing), nothing, False, (), ())
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel."""
         began, n_met = time.perf_counter(), len(data)
         data = within(data, MOST_VALUES)
-        rows, events = data.rows(), self._events(data, seed)
-        since = self._since(rows, events)
+        rows, resets = data.rows(), self._resets(data, seed)
+        since = self._since(rows, resets)
         train, held_out, train_since = self._split(data, seed, since)
         if progress is not None:
             progress(0.4)
-        flagged = flag_events(train.before, train.after) & events.any()
-        manners = self._manners(train, flagged, held_out)
-        self.fitted = fit_graphs(self.cardinalities, self.acts, train, flagged, manners=manners, since=train_since)
+        flagged = flag_resets(train.before, train.after) & resets.any()
+        effects = self._effects(train, flagged, held_out)
+        self.fitted = fit_graphs(self.cardinalities, self.encoding, train, flagged, effects=effects, since=train_since)
         likelihood, jointly = self._jointly(held_out)
         if progress is not None:
             progress(0.7)
         exact, (variables, calibration) = self._exact_match(held_out), self._described(held_out)
-        self.fitted = fit_graphs(self.cardinalities, self.acts, rows, events, True, jointly, manners, since)
+        self.fitted = fit_graphs(self.cardinalities, self.encoding, rows, resets, True, jointly, effects, since)
         if progress is not None:
             progress(1.0)
-        figures = {"nodes": float(len(self.fitted.usual.column)), "events": float(events.sum())}
+        figures = {"nodes": float(len(self.fitted.usual.feature)), "events": float(resets.sum())}
         figures |= {"changed": float((since > 0).sum()), "left out": float(n_met - len(rows))}
         report = self._report((len(rows), len(held_out)), likelihood, exact, figures)
         memory = self._memory(train, held_out)
         report = replace(report, variables=variables, calibration=calibration, memory=memory)
         return replace(report, seconds=time.perf_counter() - began)
 
-    def _since(self, rows: TransitionBatch, events: Bools) -> NDArray[np.int64]:
+    def _since(self, rows: TransitionBatch, resets: Bools) -> NDArray[np.int64]:
         """First row that tells of each factor, and of ``terminated``, as it is now, int64 [F + 1]."""
-        usual, before = np.flatnonzero(~events), self._kept()
-        groups = find_groups(self.cardinalities, rows.states, rows.next_states, ~events)
+        usual, before = np.flatnonzero(~resets), self._kept()
+        groups = find_groups(self.cardinalities, rows.states, rows.next_states, ~resets)
         variable = np.arange(len(self.cardinalities) + 1)
         for group in groups:
             variable[list(group)] = group[0]
         variable = np.unique(variable, return_inverse=True)[1]
         grouped = np.isin(np.arange(len(self.cardinalities)), [f for group in groups for f in group])
 
-        def foretell(train: TransitionBatch, tests: TransitionBatch) -> Floats:
-            logs = self._factors_foretold(train, tests)
+        def log_predictive(train: TransitionBatch, tests: TransitionBatch) -> Floats:
+            logs = self._factor_log_probs(train, tests)
             logs[:, :-1][grouped & (tests.next_states == 0)] = 0.0  # a group's value is told by the bit that is on
             return np.stack([logs[:, variable == v].sum(axis=1) for v in range(variable.max() + 1)], axis=1)
 
-        self.fitted = replace(self.fitted, has_event=False)
-        since = still_true_since(rows.select(usual), variable.max() + 1, foretell)
+        self.fitted = replace(self.fitted, has_reset=False)
+        since = last_changes(rows.select(usual), variable.max() + 1, log_predictive)
         self._restore(before)
         return np.where(since > 0, usual[since], 0)[variable]
 
@@ -190,7 +196,7 @@ class DecisionGraphModel(GraphPredictions):
             mask = new & (np.cumsum(new) > 0.9 * new.sum())
         return rows.select(~mask), rows.select(mask), np.searchsorted(np.flatnonzero(~mask), since)
 
-    def _factors_foretold(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
+    def _factor_log_probs(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
         """Log-probability of each factor's next value and of the end, [T, F + 1], after a quick look at other transitions."""
         before = self._kept()
         self._look(train)
@@ -211,19 +217,19 @@ class DecisionGraphModel(GraphPredictions):
 
     def _variables(self) -> list[Variable]:
         """What is reported of."""
-        return flat_variables(self.fitted.layout, self.fitted.usual, self.fitted.late)
+        return flat_variables(self.fitted.layout, self.fitted.usual, self.fitted.synchronic)
 
     def _memory(self, train: TransitionBatch, held_out: TransitionBatch) -> float | None:
         """What the step before tells beyond the present, nats a transition; see FitReport."""
         known, tests = steps_in_a_row(train, SOME_ROWS), steps_in_a_row(held_out, SOME_TESTS)
         if min(len(known[0]), len(tests[0])) < 2:
             return None
-        logs = self._foretold(known[0], tests[0])
+        logs = self._quick_log_probs(known[0], tests[0])
         if logs.mean() > FORETOLD:
             return 0.0
-        space, longer = with_past(*known, self.cardinalities, self.acts, self._planes())
-        _, longer_tests = with_past(*tests, self.cardinalities, self.acts, self._planes())
-        further = self._with_memory(space)._foretold(longer, longer_tests)
+        space, longer = with_past(*known, self.cardinalities, self.encoding, self._planes())
+        _, longer_tests = with_past(*tests, self.cardinalities, self.encoding, self._planes())
+        further = self._with_memory(space)._quick_log_probs(longer, longer_tests)
         gain = float((further - logs).mean())
         return gain if better(further, logs) and gain > WORTH * (1.0 - logs.mean()) else 0.0
 
@@ -233,7 +239,7 @@ class DecisionGraphModel(GraphPredictions):
     def _with_memory(self, space: FactoredSpace) -> DecisionGraphModel:
         return DecisionGraphModel(space.cardinalities, self.n_actions, parts=self.parts)
 
-    def _foretold(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
+    def _quick_log_probs(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
         """Log-probabilities of transitions after a quick look at others; what was learned stays as it is."""
         before = self._kept()
         self._look(train)
@@ -243,8 +249,8 @@ class DecisionGraphModel(GraphPredictions):
 
     def _look(self, rows: TransitionBatch) -> None:
         """Learns quickly."""
-        events = flag_events(rows.before, rows.after) & self.fitted.has_event
-        self.fitted = fit_graphs(self.cardinalities, self.acts, rows, events, True, False)
+        resets = flag_resets(rows.before, rows.after) & self.fitted.has_reset
+        self.fitted = fit_graphs(self.cardinalities, self.encoding, rows, resets, True, False)
 
     def _kept(self) -> Any:
         return self.fitted
@@ -255,15 +261,15 @@ class DecisionGraphModel(GraphPredictions):
     def _jointly(self, held_out: TransitionBatch) -> tuple[float, bool]:
         """Held-out likelihood, and whether it is better for drawing some units late."""
         likelihood = self._likelihood(self.fitted, held_out)
-        if len(self.fitted.late.changing) == 0 or len(held_out) == 0:
-            return likelihood, len(self.fitted.late.changing) > 0
-        apart = self._likelihood(replace(self.fitted, late=nothing_late(self.fitted.usual)), held_out)
+        if len(self.fitted.synchronic.changing) == 0 or len(held_out) == 0:
+            return likelihood, len(self.fitted.synchronic.changing) > 0
+        apart = self._likelihood(replace(self.fitted, synchronic=no_synchronic(self.fitted.usual)), held_out)
         return max(likelihood, apart), likelihood > apart
 
     def _report(self, sizes: tuple[int, int], likelihood: float, exact: float, figures: Mapping[str, float]) -> FitReport:
         """What a fit did; ``sizes`` are the rows fitted to and held out. Of nothing held out nothing is claimed."""
         held_out = sizes[1] > 0
-        splits = [sum(split.column >= 0 for split in search.splits) for search in self.fitted.found]
+        splits = [sum(split.feature >= 0 for split in search.splits) for search in self.fitted.found]
         return FitReport(
             n_train=sizes[0],
             n_validation=sizes[1],
@@ -274,48 +280,48 @@ class DecisionGraphModel(GraphPredictions):
             log={"questions": float(len(splits)), "splits": float(np.mean(splits)) if splits else 0.0, **figures},
         )
 
-    def _events(self, data: TransitionDataset, seed: int) -> Bools:
+    def _resets(self, data: TransitionDataset, seed: int) -> Bools:
         """Which rows are rare events; none if held-out transitions are foretold better without."""
         rows = data.rows()
-        events, gain, tested = flag_events(rows.before, rows.after), 0.0, 0
-        for split in range(MOST_SPLITS if events.sum() >= FEWEST else 0):
+        resets, gain, tested = flag_resets(rows.before, rows.after), 0.0, 0
+        for split in range(MOST_SPLITS if resets.sum() >= FEWEST else 0):
             train, held_out = data.split(self.validation, seed + split)
-            seen = flag_events(train.before, train.after)
-            with_events, without = (
-                self._likelihood(fit_graphs(self.cardinalities, self.acts, train, flags, False, False), held_out)
-                for flags in (seen, np.zeros_like(seen))
+            observed = flag_resets(train.before, train.after)
+            with_resets, without = (
+                self._likelihood(fit_graphs(self.cardinalities, self.encoding, train, flags, False, False), held_out)
+                for flags in (observed, np.zeros_like(observed))
             )
-            gain += (with_events - without) * len(held_out)
-            tested += int(flag_events(held_out.before, held_out.after).sum())
+            gain += (with_resets - without) * len(held_out)
+            tested += int(flag_resets(held_out.before, held_out.after).sum())
             if tested >= ENOUGH:
                 break
-        return events & (gain > 0.0)
+        return resets & (gain > 0.0)
 
-    def _manners(self, train: TransitionBatch, events: Bools, held_out: TransitionBatch) -> dict[int, Asking]:
+    def _effects(self, train: TransitionBatch, resets: Bools, held_out: TransitionBatch) -> dict[int, EffectModel]:
         """How each factor is asked about: as its held-out values are foretold best."""
-        n_contexts, n_columns = self.acts.n_ways * max(self.cardinalities, default=0), 2 * sum(self.cardinalities)
+        n_contexts, n_features = self.encoding.n_action_classes * max(self.cardinalities, default=0), 2 * sum(self.cardinalities)
         every = [f for f, cardinality in enumerate(self.cardinalities) if cardinality > 2]
-        if not every or n_contexts * n_columns > MOST_COUNTS or len(held_out) == 0:
+        if not every or n_contexts * n_features > MOST_COUNTS or len(held_out) == 0:
             return {}
-        folds = [(train, events, held_out)]
-        folds += [(train.select(~out), events[~out], train.select(out)) for out in more_folds(train, held_out)]
+        folds = [(train, resets, held_out)]
+        folds += [(train.select(~out), resets[~out], train.select(out)) for out in more_folds(train, held_out)]
 
-        def foretold(askings: Sequence[Asking]) -> Floats:
-            named = dict(zip(every, askings, strict=True))
-            return np.concatenate([self._foretold_in(named, *fold) for fold in folds])
+        def log_probs(effect_models: Sequence[EffectModel]) -> Floats:
+            named = dict(zip(every, effect_models, strict=True))
+            return np.concatenate([self._log_probs_with_effects(named, *fold) for fold in folds])
 
-        def partners() -> Sequence[tuple[Partner, int] | None]:
-            return likely_partners(every, candidates(self.cardinalities, self.parts), train.select(~events))
+        def operands() -> Sequence[tuple[Operand, int] | None]:
+            return likely_operands(every, candidates(self.cardinalities, self.parts), train.select(~resets))
 
-        return dict(zip(every, best_askings(foretold, len(every), partners), strict=True))
+        return dict(zip(every, best_effect_models(log_probs, len(every), operands), strict=True))
 
-    def _foretold_in(
-        self, askings: Mapping[int, Asking], train: TransitionBatch, events: Bools, held_out: TransitionBatch
+    def _log_probs_with_effects(
+        self, effect_models: Mapping[int, EffectModel], train: TransitionBatch, resets: Bools, held_out: TransitionBatch
     ) -> Floats:
         """Log-probability of the held-out next values of K factors, [N, K], that are asked about so."""
-        self.fitted = fit_graphs(self.cardinalities, self.acts, train, events, False, False, askings)
+        self.fitted = fit_graphs(self.cardinalities, self.encoding, train, resets, False, False, effect_models)
         start = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64)
-        probs, factors = self.marginals(held_out.states, held_out.actions), list(askings)
+        probs, factors = self.marginals(held_out.states, held_out.actions), list(effect_models)
         chosen = np.take_along_axis(probs, start[factors] + held_out.after[:, factors], axis=1)
         logs: Floats = np.log(chosen.clip(1e-9))
         return logs
@@ -338,13 +344,17 @@ class DecisionGraphModel(GraphPredictions):
         """See TransitionModel."""
         fitted = self.fitted
         layout, grouped = fitted.layout, np.flatnonzero(np.diff(fitted.layout.first) > 1)
-        groups = [(int(unit), int(f)) for unit in grouped for f in layout.members[layout.first[unit] : layout.first[unit + 1]]]
+        groups = [
+            (int(variable), int(f))
+            for variable in grouped
+            for f in layout.members[layout.first[variable] : layout.first[variable + 1]]
+        ]
         state: dict[str, NDArray[Any]] = {
             "groups": np.asarray(groups, dtype=np.int64).reshape(-1, 2),
-            "couplings": fitted.layout.coupling_of.copy(),
-            "has_event": np.asarray(fitted.has_event),
+            "couplings": fitted.layout.mutex_of.copy(),
+            "has_event": np.asarray(fitted.has_reset),
         }
-        for name, graphs in (("usual", fitted.usual), ("late", fitted.late), ("event", fitted.event)):
+        for name, graphs in (("usual", fitted.usual), ("late", fitted.synchronic), ("event", fitted.reset)):
             state.update({f"{name}.{part}": array for part, array in to_arrays(graphs).items()})
         return state
 
@@ -364,24 +374,26 @@ class DecisionGraphModel(GraphPredictions):
         if wrong:
             raise ValueError(f"These weights are not those of a decision graph model (first difference: {wrong[0]!r}).")
         pairs = table_of(state["groups"], 2)
-        groups = [tuple(int(f) for f in pairs[pairs[:, 0] == unit, 1]) for unit in np.unique(pairs[:, 0])]
+        groups = [tuple(int(f) for f in pairs[pairs[:, 0] == variable, 1]) for variable in np.unique(pairs[:, 0])]
         members = pairs[:, 1]
         bits = np.flatnonzero(np.asarray(self.cardinalities) == 2)
         if len(np.unique(members)) < len(members) or not np.isin(members, bits).all() or any(len(g) < 2 for g in groups):
             raise ValueError(
                 "These weights group other bits than this model has; load them into a model of the same environment."
             )
-        layout = lay_out(self.cardinalities, groups, self.acts)
-        couplings = np.asarray(state["couplings"], dtype=np.int64).reshape(-1)
-        coupled = np.flatnonzero(couplings >= 0)
-        if len(couplings) != len(layout.outputs) or not is_lone_bit(layout)[coupled].all():
+        layout = make_layout(self.cardinalities, groups, self.encoding)
+        mutexes = np.asarray(state["couplings"], dtype=np.int64).reshape(-1)
+        mutex_members = np.flatnonzero(mutexes >= 0)
+        if len(mutexes) != len(layout.outputs) or not is_lone_bit(layout)[mutex_members].all():
             raise ValueError(
                 "These weights couple other bits than this model has; load them into a model of the same environment."
             )
-        layout = coupled_layout(layout, [coupled[couplings[coupled] == q] for q in np.unique(couplings[coupled])])
-        now, both = n_columns(layout), n_columns(layout) + len(layout.factor)
-        usual, late, event = (
+        layout = layout_with_mutexes(
+            layout, [mutex_members[mutexes[mutex_members] == q] for q in np.unique(mutexes[mutex_members])]
+        )
+        now, both = n_features(layout), n_features(layout) + len(layout.factor)
+        usual, synchronic, reset = (
             from_arrays({part: state[f"{name}.{part}"] for part in SAVED}, layout, n)
             for name, n in (("usual", now), ("late", both), ("event", now))
         )
-        self.fitted = Fitted(layout, usual, late, event, bool(np.any(state["has_event"])), (), ())
+        self.fitted = Fitted(layout, usual, synchronic, reset, bool(np.any(state["has_event"])), (), ())

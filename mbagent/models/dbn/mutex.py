@@ -50,8 +50,8 @@ def find_groups(
     some = np.linspace(0, len(states) - 1, min(len(states), MOST_ROWS)).astype(np.int64)
     before, after = states[some][:, bits] == 1, next_states[some][:, bits] == 1
     kept = slice(None) if usual is None else usual[some]
-    came, went = (after & ~before)[kept].astype(np.float32), (before & ~after)[kept].astype(np.float32)
-    swaps = went.T @ came
+    positives, went = (after & ~before)[kept].astype(np.float32), (before & ~after)[kept].astype(np.float32)
+    swaps = went.T @ positives
     swaps += swaps.T
     on = np.concatenate([before, after]).astype(np.float32)
     exclusive = on.T @ on == 0
@@ -111,23 +111,23 @@ def widest(layout: Layout) -> int:
     """Room that the distribution of any unit or coupling needs."""
     room = layout.outputs.max()
     for q in range(len(layout.exactly)):
-        room = max(room, layout.coupled_first[q + 1] - layout.coupled_first[q] + 1)
+        room = max(room, layout.mutex_first[q + 1] - layout.mutex_first[q] + 1)
     return int(room)
 
 
 @compiled
-def couple(coupling: int, state: Ints, rates: Floats, still: Bools, layout: Layout, graphs: Graphs, out: Floats) -> int:
+def mutex_distribution(mutex: int, state: Ints, rates: Floats, still: Bools, layout: Layout, graphs: Graphs, out: Floats) -> int:
     """Writes the probability of each bit of a coupling, and of none, to ``out``; returns how many bits there are.
 
     ``rates`` are all units' distributions; a bit that is ``still`` [U], without graphs, is as sure as it is in ``state``.
     """
-    first, last = layout.coupled_first[coupling], layout.coupled_first[coupling + 1]
+    first, last = layout.mutex_first[mutex], layout.mutex_first[mutex + 1]
     n, total = last - first, 0.0
     for k in range(n):
-        unit = layout.coupled[first + k]
-        out[k] = state[layout.members[layout.first[unit]]] if still[unit] else rates[graphs.start[unit] + 1]
+        variable = layout.mutex_members[first + k]
+        out[k] = state[layout.members[layout.first[variable]]] if still[variable] else rates[graphs.start[variable] + 1]
         total += out[k]
-    none = 0.0 if layout.exactly[coupling] and total > 1e-9 else max(0.0, 1.0 - total)
+    none = 0.0 if layout.exactly[mutex] and total > 1e-9 else max(0.0, 1.0 - total)
     for k in range(n):
         out[k] /= total + none
     out[n] = none / (total + none)
@@ -135,12 +135,12 @@ def couple(coupling: int, state: Ints, rates: Floats, still: Bools, layout: Layo
 
 
 @compiled
-def n_choices(coupling: int, state: Ints, rates: Floats, still: Bools, layout: Layout, graphs: Graphs) -> int:
+def n_choices(mutex: int, state: Ints, rates: Floats, still: Bools, layout: Layout, graphs: Graphs) -> int:
     """How many bits of a coupling may be on, and one more for none, unless a bit is sure to be on; at least 1."""
     possible, sure = 0, False
-    for k in range(layout.coupled_first[coupling], layout.coupled_first[coupling + 1]):
-        unit = layout.coupled[k]
-        rate = float(state[layout.members[layout.first[unit]]]) if still[unit] else rates[graphs.start[unit] + 1]
+    for k in range(layout.mutex_first[mutex], layout.mutex_first[mutex + 1]):
+        variable = layout.mutex_members[k]
+        rate = float(state[layout.members[layout.first[variable]]]) if still[variable] else rates[graphs.start[variable] + 1]
         possible += int(rate > 0.0)
         sure |= rate >= 1.0
     return possible + int(not sure)
@@ -157,20 +157,20 @@ def leave_out_none(chances: Floats, n: int) -> None:
 
 
 @compiled
-def settle(state: Ints, coupling: int, chosen: int, layout: Layout) -> None:
+def settle(state: Ints, mutex: int, chosen: int, layout: Layout) -> None:
     """Switches the chosen bit of a coupling on and all others off; none where ``chosen`` is their number."""
-    first, last = layout.coupled_first[coupling], layout.coupled_first[coupling + 1]
+    first, last = layout.mutex_first[mutex], layout.mutex_first[mutex + 1]
     for k in range(last - first):
-        state[layout.members[layout.first[layout.coupled[first + k]]]] = 1 if k == chosen else 0
+        state[layout.members[layout.first[layout.mutex_members[first + k]]]] = 1 if k == chosen else 0
 
 
 @compiled
-def which(state: Ints, coupling: int, layout: Layout) -> int:
+def which(state: Ints, mutex: int, layout: Layout) -> int:
     """Which bit of a coupling is on; their number if none is, -1 if several are."""
-    first, last = layout.coupled_first[coupling], layout.coupled_first[coupling + 1]
+    first, last = layout.mutex_first[mutex], layout.mutex_first[mutex + 1]
     found = last - first
     for k in range(last - first):
-        if state[layout.members[layout.first[layout.coupled[first + k]]]] == 1:
+        if state[layout.members[layout.first[layout.mutex_members[first + k]]]] == 1:
             if found < last - first:
                 return -1
             found = k

@@ -14,21 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.data import Factors
-from mbagent.models.dbn.features import BEYOND, act_columns
+from mbagent.models.dbn.features import BEYOND, action_features
 from mbagent.types import Bools, Ints
 from mbagent_envs.jit import compiled
 
 _T = TypeVar("_T", bound=np.generic)
 
-CELL, BORDER, ACTION, MEETING, NEXT, WRAP, NEXT_MEETING = 0, 1, 2, 3, 4, 5, 6
+CELL, BORDER, ACTION, ADJACENCY, NEXT, WRAP, NEXT_ADJACENCY = 0, 1, 2, 3, 4, 5, 6
 """Kinds of relative columns, and what follows the kind:
 
 - CELL: channel, value, rows below, columns to the right;
 - BORDER: rows below, columns to the right;
-- ACTION: number of the column, and the actions that have it on: stride, n, value, see ``acts.act_columns``;
-- MEETING: channel, value, channel (``BEYOND``: what lies beyond the border), value, rows below, columns to the right; a value
+- ACTION: number of the column, and the actions that have it on: stride, n, value, see ``encoding.action_features``;
+- ADJACENCY: channel, value, channel (``BEYOND``: what lies beyond the border), value, rows below, columns to the right; a value
   with itself at no distance: whether it is anywhere;
-- NEXT, NEXT_MEETING: a CELL and a MEETING of the next state;
+- NEXT, NEXT_ADJACENCY: a CELL and a ADJACENCY of the next state;
 - WRAP: a CELL that lies beyond the border, and so at the other end.
 """
 
@@ -52,7 +52,7 @@ NEXT_RADIUS = 2
 """Rows and columns that a neighbourhood in the next state reaches: two places that a thing may go to lie so far apart."""
 
 
-def relative_columns(cardinalities: Sequence[int], parts: Sequence[int], reach: Reach) -> Ints:
+def relative_features(cardinalities: Sequence[int], parts: Sequence[int], reach: Reach) -> Ints:
     """All relative columns, int64 [D, 7]; see above.
 
     Args:
@@ -63,20 +63,20 @@ def relative_columns(cardinalities: Sequence[int], parts: Sequence[int], reach: 
     near = range(-reach.radius, reach.radius + 1)
     offsets = list(itertools.product(near, near))
     shown = [(c, v) for c, k in enumerate(cardinalities) for v in (range(k) if k != 2 else (1,))]
-    columns = [(CELL, c, v, dy, dx, 0, 0) for dy, dx in offsets for c, v in shown]
-    columns += [(BORDER, dy, dx, 0, 0, 0, 0) for dy, dx in offsets if (dy, dx) != (0, 0)]
-    columns += [(ACTION, number, *column, 0, 0) for number, column in enumerate(act_columns(parts))]
-    meetings = list(_meetings(shown))
-    columns += [(MEETING, *meeting) for meeting in meetings]
+    features = [(CELL, c, v, dy, dx, 0, 0) for dy, dx in offsets for c, v in shown]
+    features += [(BORDER, dy, dx, 0, 0, 0, 0) for dy, dx in offsets if (dy, dx) != (0, 0)]
+    features += [(ACTION, number, *feature, 0, 0) for number, feature in enumerate(action_features(parts))]
+    adjacencies = list(_adjacencies(shown))
+    features += [(ADJACENCY, *adjacency) for adjacency in adjacencies]
     further = range(-NEXT_RADIUS, NEXT_RADIUS + 1)
-    columns += [(NEXT, c, v, dy, dx, 0, 0) for dy, dx in itertools.product(further, further) for c, v in shown]
-    columns += [(NEXT_MEETING, *meeting) for meeting in meetings]
+    features += [(NEXT, c, v, dy, dx, 0, 0) for dy, dx in itertools.product(further, further) for c, v in shown]
+    features += [(NEXT_ADJACENCY, *adjacency) for adjacency in adjacencies]
     if reach.wrap:
-        columns += [(WRAP, c, v, dy, dx, 0, 0) for dy, dx in offsets for c, v in shown if (dy, dx) != (0, 0)]
-    return np.asarray(columns, dtype=np.int64).reshape(-1, 7)
+        features += [(WRAP, c, v, dy, dx, 0, 0) for dy, dx in offsets for c, v in shown if (dy, dx) != (0, 0)]
+    return np.asarray(features, dtype=np.int64).reshape(-1, 7)
 
 
-def _meetings(shown: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int, int, int, int, int]]:
+def _adjacencies(shown: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int, int, int, int, int]]:
     """Two things at one place or side by side, and a thing at one of the four sides."""
     for i, first in enumerate(shown):
         for second in shown[i:]:
@@ -87,14 +87,14 @@ def _meetings(shown: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int, int,
             yield (*first, BEYOND, 0, dy, dx)
 
 
-def known_columns(columns: Ints, before: Factors, after: Factors) -> Ints:
+def informative_features(features: Ints, before: Factors, after: Factors) -> Ints:
     """Numbers of the relative columns that may tell something, by what was met.
 
     Values that never came tell nothing, nor do meetings of channels that only repeat another channel's past, or that are
     the same all over the board; of the latter one cell tells all.
 
     Args:
-        columns: int64 [D, 7].
+        features: int64 [D, 7].
         before: planes, int [N, C, H, W].
         after: those of the next states.
     """
@@ -108,14 +108,16 @@ def known_columns(columns: Ints, before: Factors, after: Factors) -> Ints:
     }
 
     def known(kind: int, channel: int, value: int, other: int, second: int) -> bool:
-        came = then if kind in (NEXT, NEXT_MEETING) else now  # what ends an episode is never left again
+        positives = then if kind in (NEXT, NEXT_ADJACENCY) else now  # what ends an episode is never left again
         if kind in (CELL, NEXT, WRAP):
-            return value in came[channel] and (channel not in even or (kind != WRAP and (other, second) == (0, 0)))
-        if kind not in (MEETING, NEXT_MEETING):
+            return value in positives[channel] and (channel not in even or (kind != WRAP and (other, second) == (0, 0)))
+        if kind not in (ADJACENCY, NEXT_ADJACENCY):
             return True
-        return channel in live and other in live and value in came[channel] and (other == BEYOND or second in came[other])
+        return (
+            channel in live and other in live and value in positives[channel] and (other == BEYOND or second in positives[other])
+        )
 
-    return np.flatnonzero([known(*column[:5]) for column in columns.tolist()])
+    return np.flatnonzero([known(*feature[:5]) for feature in features.tolist()])
 
 
 def _values(plane: Factors) -> set[int]:
@@ -128,12 +130,12 @@ def _repeats(after: Factors, before: Factors) -> bool:
     return bool((after[some] == before[some]).all() and (after == before).all())
 
 
-def told_by(channel: int, columns: Ints, numbers: Ints, before: Factors, after: Factors, actions: Ints) -> Ints | None:
+def determined_by(channel: int, features: Ints, numbers: Ints, before: Factors, after: Factors, actions: Ints) -> Ints | None:
     """Numbers of the columns that alone tell what a channel becomes everywhere: another's present values, or an action.
 
     Args:
         channel: the channel.
-        columns: int64 [D, 7].
+        features: int64 [D, 7].
         numbers: those that may be taken, int64 [K].
         before: planes, int [N, C, H, W].
         after: those of the next states.
@@ -142,118 +144,118 @@ def told_by(channel: int, columns: Ints, numbers: Ints, before: Factors, after: 
     Returns:
         Numbers, or None where no other channel or action does.
     """
-    here = numbers[(columns[numbers, 0] == CELL) & (columns[numbers, 3:5] == 0).all(axis=1)]
-    for other in np.unique(columns[here, 1]):
+    here = numbers[(features[numbers, 0] == CELL) & (features[numbers, 3:5] == 0).all(axis=1)]
+    for other in np.unique(features[here, 1]):
         if other != channel and _repeats(after[:, channel], before[:, other]):
-            told: Ints = here[columns[here, 1] == other]
-            return told
-    for number in numbers[columns[numbers, 0] == ACTION]:
-        taken = _acts(columns[number], actions)[:, None, None]
+            determined: Ints = here[features[here, 1] == other]
+            return determined
+    for number in numbers[features[numbers, 0] == ACTION]:
+        taken = _action_is(features[number], actions)[:, None, None]
         if _repeats(after[:, channel], np.broadcast_to(taken, after[:, channel].shape).astype(after.dtype)):
             return np.asarray([number])
     return None
 
 
-def column_values(columns: Ints, planes: Factors, actions: Ints, after: Factors | None = None) -> Bools:
+def feature_values(features: Ints, planes: Factors, actions: Ints, after: Factors | None = None) -> Bools:
     """Which columns are on for every transition and position, bool [N * P, D], positions of a transition together.
 
     Args:
-        columns: relative columns, int64 [D, 7].
+        features: relative columns, int64 [D, 7].
         planes: int [N, C, H, W].
         actions: int64 [N].
         after: the next states' planes, for columns of the kind NEXT.
     """
-    return np.ascontiguousarray(column_planes(columns, planes, actions, after).reshape(len(columns), -1).T)
+    return np.ascontiguousarray(feature_planes(features, planes, actions, after).reshape(len(features), -1).T)
 
 
-def column_planes(columns: Ints, planes: Factors, actions: Ints, after: Factors | None = None) -> Bools:
-    """As ``column_values``, one column after another, bool [D, N, H, W]."""
+def feature_planes(features: Ints, planes: Factors, actions: Ints, after: Factors | None = None) -> Bools:
+    """As ``feature_values``, one column after another, bool [D, N, H, W]."""
     n, _, height, width = planes.shape
-    table = np.empty((len(columns), n, height, width), dtype=np.bool_)
+    table = np.empty((len(features), n, height, width), dtype=np.bool_)
     inside = np.ones((height, width), dtype=np.bool_)
-    for d, (kind, *parts) in enumerate(columns.tolist()):
+    for d, (kind, *parts) in enumerate(features.tolist()):
         if kind == BORDER:
             table[d] = ~shifted(inside[None], parts[0], parts[1])
         elif kind == ACTION:
-            table[d] = _acts(columns[d], actions)[:, None, None]
-        elif kind in (MEETING, NEXT_MEETING):
-            table[d] = far_value(columns[d], planes, actions, after)[:, None, None]
+            table[d] = _action_is(features[d], actions)[:, None, None]
+        elif kind in (ADJACENCY, NEXT_ADJACENCY):
+            table[d] = far_value(features[d], planes, actions, after)[:, None, None]
         else:
             shown = _shown(kind, planes, after)[:, parts[0]] == parts[1]
             table[d] = wrapped(shown, *parts[2:4]) if kind == WRAP else shifted(shown, *parts[2:4])
     return table
 
 
-def values_at(columns: Ints, planes: Factors, actions: Ints, rows: Ints, y: Ints, x: Ints) -> Bools:
-    """As ``column_values``, of some positions of some transitions only, bool [K, D].
+def values_at(features: Ints, planes: Factors, actions: Ints, rows: Ints, y: Ints, x: Ints) -> Bools:
+    """As ``feature_values``, of some positions of some transitions only, bool [K, D].
 
     Args:
-        columns: relative columns of this state, int64 [D, 7].
+        features: relative columns of this state, int64 [D, 7].
         planes: int [N, C, H, W].
         actions: int64 [N].
         rows: transition of each, int64 [K].
         y: row of its position, int64 [K].
         x: column of its position, int64 [K].
     """
-    table = np.zeros((len(rows), len(columns)), dtype=np.bool_)
+    table = np.zeros((len(rows), len(features)), dtype=np.bool_)
     order = np.argsort(rows, kind="stable")
     for begin in range(0, len(rows), PIECE):
         some = order[begin : begin + PIECE]
         met, where = np.unique(rows[some], return_inverse=True)
-        wide, part = planes[met].astype(np.int64), np.zeros((len(some), len(columns)), dtype=np.bool_)
-        _look_around(columns, wide, where, y[some], x[some], part)
-        for d in np.flatnonzero(np.isin(columns[:, 0], (ACTION, MEETING))):
-            part[:, d] = far_value(columns[d], wide, actions[met], None)[where]
+        wide, part = planes[met].astype(np.int64), np.zeros((len(some), len(features)), dtype=np.bool_)
+        _look_around(features, wide, where, y[some], x[some], part)
+        for d in np.flatnonzero(np.isin(features[:, 0], (ACTION, ADJACENCY))):
+            part[:, d] = far_value(features[d], wide, actions[met], None)[where]
         table[some] = part
     return table
 
 
 @compiled
-def _look_around(columns: Ints, planes: Ints, rows: Ints, y: Ints, x: Ints, out: Bools) -> None:
+def _look_around(features: Ints, planes: Ints, rows: Ints, y: Ints, x: Ints, out: Bools) -> None:
     """The part of ``values_at`` that differs from position to position."""
     _, _, height, width = planes.shape
     for k in range(len(rows)):
-        for d in range(len(columns)):
-            kind = columns[d, 0]
+        for d in range(len(features)):
+            kind = features[d, 0]
             if kind == BORDER:
-                row, column = y[k] + columns[d, 1], x[k] + columns[d, 2]
-                out[k, d] = not (0 <= row < height and 0 <= column < width)
+                row, col = y[k] + features[d, 1], x[k] + features[d, 2]
+                out[k, d] = not (0 <= row < height and 0 <= col < width)
             elif kind in (CELL, WRAP):
-                row, column = y[k] + columns[d, 3], x[k] + columns[d, 4]
-                inside = 0 <= row < height and 0 <= column < width
+                row, col = y[k] + features[d, 3], x[k] + features[d, 4]
+                inside = 0 <= row < height and 0 <= col < width
                 if inside and kind == CELL:
-                    out[k, d] = planes[rows[k], columns[d, 1], row, column] == columns[d, 2]
+                    out[k, d] = planes[rows[k], features[d, 1], row, col] == features[d, 2]
                 elif not inside and kind == WRAP:
-                    out[k, d] = planes[rows[k], columns[d, 1], row % height, column % width] == columns[d, 2]
+                    out[k, d] = planes[rows[k], features[d, 1], row % height, col % width] == features[d, 2]
 
 
 def _shown(kind: int, planes: Factors, after: Factors | None) -> Factors:
-    if kind not in (NEXT, NEXT_MEETING):
+    if kind not in (NEXT, NEXT_ADJACENCY):
         return planes
     assert after is not None
     return after
 
 
-def _acts(column: Ints, actions: Ints) -> Bools:
+def _action_is(feature: Ints, actions: Ints) -> Bools:
     """Whether each action [N] has a column on."""
-    on: Bools = actions // column[2] % column[3] == column[4]
+    on: Bools = actions // feature[2] % feature[3] == feature[4]
     return on
 
 
-def far_value(column: Ints, planes: Factors, actions: Ints, after: Factors | None) -> Bools:
-    """As ``column_values``, for a column that is the same at all positions, bool [N]."""
-    kind = int(column[0])
-    return _acts(column, actions) if kind == ACTION else meets(_shown(kind, planes, after), column[1:])
+def far_value(feature: Ints, planes: Factors, actions: Ints, after: Factors | None) -> Bools:
+    """As ``feature_values``, for a column that is the same at all positions, bool [N]."""
+    kind = int(feature[0])
+    return _action_is(feature, actions) if kind == ACTION else are_adjacent(_shown(kind, planes, after), feature[1:])
 
 
 def shifted(plane: NDArray[_T], below: int, right: int) -> NDArray[_T]:
     """What lies so many rows below and columns to the right of each position of [N, H, W]; 0 beyond the border."""
     _, height, width = plane.shape
     result = np.zeros_like(plane)
-    rows, columns = slice(max(0, -below), min(height, height - below)), slice(max(0, -right), min(width, width - right))
+    rows, cols = slice(max(0, -below), min(height, height - below)), slice(max(0, -right), min(width, width - right))
     source_rows = slice(max(0, below), min(height, height + below))
-    source_columns = slice(max(0, right), min(width, width + right))
-    result[:, rows, columns] = plane[:, source_rows, source_columns]
+    source_cols = slice(max(0, right), min(width, width + right))
+    result[:, rows, cols] = plane[:, source_rows, source_cols]
     return result
 
 
@@ -264,38 +266,38 @@ def wrapped(plane: NDArray[_T], below: int, right: int) -> NDArray[_T]:
     return np.where(inside, np.zeros_like(around), around)
 
 
-def meets(planes: Factors, meeting: Ints) -> Bools:
+def are_adjacent(planes: Factors, adjacency: Ints) -> Bools:
     """Whether, anywhere, one channel has a value and the other has its value so far from there, bool [N]."""
-    first, value, second, other, below, right = (int(part) for part in meeting)
+    first, value, second, other, below, right = (int(part) for part in adjacency)
     inside = np.ones((1, *planes.shape[2:]), dtype=np.bool_)
     there = ~shifted(inside, below, right) if second == BEYOND else shifted(planes[:, second] == other, below, right)
     found: Bools = ((planes[:, first] == value) & there).any(axis=(1, 2))
     return found
 
 
-def column_kinds(columns: Ints) -> Ints:
+def feature_kinds(features: Ints) -> Ints:
     """Which kind of thing each relative column is, int64 [D]: a channel's cells (now, next), border, action, meeting."""
-    kind = columns[:, 0]
-    n_channels = int(columns[kind == CELL, 1].max(initial=0)) + 1
+    kind = features[:, 0]
+    n_channels = int(features[kind == CELL, 1].max(initial=0)) + 1
     of_channel = np.isin(kind, (CELL, NEXT, WRAP))
-    kinds = np.where(of_channel, columns[:, 1] + n_channels * (kind == NEXT), 2 * n_channels + kind)
+    kinds = np.where(of_channel, features[:, 1] + n_channels * (kind == NEXT), 2 * n_channels + kind)
     return kinds.astype(np.int64)
 
 
-def named_column(column: Ints) -> str:
+def feature_name(feature: Ints) -> str:
     """A relative column in words."""
-    kind, *parts = (int(part) for part in column)
+    kind, *parts = (int(part) for part in feature)
     if kind == ACTION:
         return (
             f"action {parts[3]}" if parts[1] == 1 and parts[0] == parts[3] else f"action // {parts[1]} % {parts[2]} = {parts[3]}"
         )
     if kind == BORDER:
         return f"border at ({parts[0]:+d}, {parts[1]:+d})"
-    if kind in (MEETING, NEXT_MEETING):
+    if kind in (ADJACENCY, NEXT_ADJACENCY):
         other = "the border" if parts[2] == BEYOND else f"channel {parts[2]} = {parts[3]}"
         words = f"channel {parts[0]} = {parts[1]} anywhere"
         words += "" if parts[:2] == parts[2:4] and parts[4:] == [0, 0] else f" with {other} at ({parts[4]:+d}, {parts[5]:+d})"
     else:
         words = f"channel {parts[0]} = {parts[1]} at ({parts[2]:+d}, {parts[3]:+d})"
         words += " around the board" if kind == WRAP else ""
-    return f"next {words}" if kind in (NEXT, NEXT_MEETING) else words
+    return f"next {words}" if kind in (NEXT, NEXT_ADJACENCY) else words

@@ -18,16 +18,24 @@ from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.models.base import FitReport
 from mbagent.models.dbn import sampling
 from mbagent.models.dbn.arrays import Graphs, build
-from mbagent.models.dbn.change_points import still_true_since
-from mbagent.models.dbn.features import Layout, Question, Seen, ask, distinct
-from mbagent.models.dbn.fitting import UNCERTAIN, Fitted, fit_graphs, go_together, nothing_late, uncertain_rows
-from mbagent.models.dbn.grounding import COLUMN, ROW, WHOLE, Coupling, LocalGraphs, instantiate, with_couplings, with_laws
-from mbagent.models.dbn.invariants import LAWLESS, Laws, all_kept, find_laws, n_combinations
-from mbagent.models.dbn.large_data import PlaneTable, channel_layout, zoom
-from mbagent.models.dbn.model import IMPOSSIBLE, DecisionGraphModel, asked_columns, hangs_on_action
-from mbagent.models.dbn.plane_features import NEXT, NEXT_MEETING, Reach, column_values, named_column, relative_columns, shifted
+from mbagent.models.dbn.change_points import last_changes
+from mbagent.models.dbn.features import Layout, Observed, Question, ask, distinct
+from mbagent.models.dbn.fitting import UNCERTAIN, Fitted, fit_graphs, go_together, no_synchronic, uncertain_rows
+from mbagent.models.dbn.grounding import COLUMN, ROW, WHOLE, LocalGraphs, Mutex, instantiate, with_invariants, with_mutexes
+from mbagent.models.dbn.invariants import NO_INVARIANTS, Invariants, all_kept, find_invariants, n_combinations
+from mbagent.models.dbn.large_data import PlaneTable, channel_layout, refine
+from mbagent.models.dbn.model import IMPOSSIBLE, DecisionGraphModel, depends_on_action, tested_features
+from mbagent.models.dbn.plane_features import (
+    NEXT,
+    NEXT_ADJACENCY,
+    Reach,
+    feature_name,
+    feature_values,
+    relative_features,
+    shifted,
+)
 from mbagent.models.dbn.serialization import SAVED, from_arrays, table_of, to_arrays
-from mbagent.models.dbn.smoothing import habit_of
+from mbagent.models.dbn.smoothing import smoothing_of
 from mbagent.models.dbn.splits import Search
 from mbagent.models.fit_report import Variable
 from mbagent.models.held_out import FORETOLD, SOME_ROWS, SOME_TESTS, better, thinned
@@ -41,20 +49,20 @@ SOME_CELLS = 100_000
 """Cells that are looked at for errors that go together."""
 
 
-def learn_channels(planes: PlaneTable) -> tuple[Graphs, list[Question], list[Search]]:
+def fit_channels(planes: PlaneTable) -> tuple[Graphs, list[Question], list[Search]]:
     """Graphs of all channels, each cell for itself, and of ``terminated``."""
     asked: list[Question] = []
     copied_asked: list[Question] = []
     copied: list[Search] = []
     for channel, cardinality in enumerate(planes.cardinalities):
-        columns = planes.told_by(channel)
-        if columns is None:
-            asked += ask(channel, cardinality, planes.seen(channel))
+        features = planes.determined_by(channel)
+        if features is None:
+            asked += ask(channel, cardinality, planes.observed(channel))
         else:
-            questions, table = planes.copying(channel, columns)
-            copied_asked, copied = copied_asked + questions, copied + planes.split(questions, table, columns)
+            questions, table = planes.copying(channel, features)
+            copied_asked, copied = copied_asked + questions, copied + planes.split(questions, table, features)
     found = planes.split(asked, planes.table, planes.near) if asked else []
-    found = zoom(planes, asked, found)
+    found = refine(planes, asked, found)
     asked, found = asked + copied_asked, found + copied
     if planes.rows.terminated.any():
         over, searches = _ends(planes, planes.far)
@@ -68,11 +76,15 @@ def _ends(planes: PlaneTable, numbers: Ints) -> tuple[list[Question], list[Searc
     first, pattern = distinct(np.packbits(far, axis=1))
     nothing, ends = np.zeros(len(rows), dtype=np.int64), rows.terminated.astype(np.int64)
     counting = np.arange(min(planes.since[-1], len(rows)), len(rows))
-    asked = ask(len(planes.cardinalities), 2, Seen(pattern, planes.acts.way[rows.actions], nothing, ends).select(counting))
+    asked = ask(
+        len(planes.cardinalities),
+        2,
+        Observed(pattern, planes.encoding.action_class[rows.actions], nothing, ends).select(counting),
+    )
     return asked, planes.split(asked, far[first], numbers)
 
 
-def learn_late(planes: PlaneTable, layout: Layout, graphs: Graphs) -> tuple[Graphs, list[Question], list[Search]]:
+def fit_synchronic(planes: PlaneTable, layout: Layout, graphs: Graphs) -> tuple[Graphs, list[Question], list[Search]]:
     """Graphs of the channels whose cells hang on what others become, given those; and of ``terminated``.
 
     Args:
@@ -80,30 +92,30 @@ def learn_late(planes: PlaneTable, layout: Layout, graphs: Graphs) -> tuple[Grap
         layout: of the board.
         graphs: of all cells, each for itself.
     """
-    late, asked, found = [], [], []
+    synchronic, asked, found = [], [], []
     for channel, numbers in _dependent(planes, layout, graphs).items():
-        units = layout.cells[channel].ravel()
-        needed = uncertain_rows(planes.rows, layout, graphs, units)
+        variables = layout.cells[channel].ravel()
+        needed = uncertain_rows(planes.rows, layout, graphs, variables)
         counting = planes.cells_since(channel)
-        kept = np.flatnonzero((needed & (layout.coupling_of[units] < 0)).ravel()[counting])
-        some, which = planes.seen(channel).select(kept), counting[kept]
-        following = column_values(planes.columns[numbers], planes.before, planes.rows.actions, planes.after)[which]
+        kept = np.flatnonzero((needed & (layout.mutex_of[variables] < 0)).ravel()[counting])
+        some, which = planes.observed(channel).select(kept), counting[kept]
+        following = feature_values(planes.features[numbers], planes.before, planes.rows.actions, planes.after)[which]
         first, pattern = distinct(following, some.pattern)
         questions = ask(channel, planes.cardinalities[channel], replace(some, pattern=pattern))
         table = np.concatenate([planes.table[some.pattern[first]], following[first]], axis=1)
         searches = planes.split(questions, table, np.concatenate([planes.near, numbers])) if questions else []
-        if any(split.column in numbers for search in searches for split in search.splits):
-            late.append(channel)
+        if any(split.feature in numbers for search in searches for split in search.splits):
+            synchronic.append(channel)
             asked += questions
             found += searches
     if planes.rows.terminated.any():
         over, searches = _ends(planes, np.concatenate([planes.far, planes.next_far]))
-        if any(split.column in planes.next_far for search in searches for split in search.splits):
-            late.append(len(planes.cardinalities))
+        if any(split.feature in planes.next_far for search in searches for split in search.splits):
+            synchronic.append(len(planes.cardinalities))
             asked, found = asked + over, found + searches
-    if not late:
-        return nothing_late(graphs), [], []
-    return planes.build(asked, found)._replace(changing=np.asarray(late, dtype=np.int64)), asked, found
+    if not synchronic:
+        return no_synchronic(graphs), [], []
+    return planes.build(asked, found)._replace(changing=np.asarray(synchronic, dtype=np.int64)), asked, found
 
 
 def _dependent(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[int, Ints]:
@@ -112,10 +124,10 @@ def _dependent(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[int, 
     found: dict[int, Ints] = {}
     for channel in sorted({c for c, _ in errors}):
         own = [errors[key] for key in errors if key[0] == channel]
-        earlier = [d for d in np.flatnonzero(planes.columns[:, 0] == NEXT) if _is_earlier(planes.columns[d], channel)]
+        earlier = [d for d in np.flatnonzero(planes.features[:, 0] == NEXT) if _is_earlier(planes.features[d], channel)]
         kept = []
         for d in earlier:
-            _, other, value, below, right, _, _ = (int(part) for part in planes.columns[d])
+            _, other, value, below, right, _, _ = (int(part) for part in planes.features[d])
             if (other, value) in errors:
                 error, spread = (shifted(part, below, right) for part in errors[other, value])
                 if any(go_together(e, error, v, spread, len(earlier)) for e, v in own):
@@ -125,9 +137,9 @@ def _dependent(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[int, 
     return found
 
 
-def _is_earlier(column: Ints, channel: int) -> bool:
+def _is_earlier(feature: Ints, channel: int) -> bool:
     """Whether a cell of the next state is drawn before those of the channel at the same place."""
-    return bool(column[1] < channel or (column[1] == channel and tuple(column[3:5]) < (0, 0)))
+    return bool(feature[1] < channel or (feature[1] == channel and tuple(feature[3:5]) < (0, 0)))
 
 
 def _errors(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[tuple[int, int], tuple[Floats, Floats]]:
@@ -144,7 +156,7 @@ def _errors(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[tuple[in
     sampling.marginals(rows.states, rows.actions, layout, graphs, start, probs)
     found = {}
     for channel, k in enumerate(planes.cardinalities):
-        alone = layout.coupling_of[layout.cells[channel]] < 0
+        alone = layout.mutex_of[layout.cells[channel]] < 0
         for value in range(k) if k > 2 else (1,):
             p = probs[:, start[layout.cells[channel]] + value]
             spread = p * (1.0 - p) * alone
@@ -153,9 +165,9 @@ def _errors(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[tuple[in
     return found
 
 
-def find_couplings(
+def find_mutexes(
     rows: TransitionBatch, board: PlaneLayout, cardinalities: tuple[int, ...], some: TransitionBatch, ones: Floats
-) -> tuple[Coupling, ...]:
+) -> tuple[Mutex, ...]:
     """Sets of cells that are coupled: whole channels of which one cell is on, or lines of which two are never on.
 
     Args:
@@ -168,11 +180,11 @@ def find_couplings(
     if len(rows) == 0:
         return ()
     before, after = board.to_planes(rows.before), board.to_planes(rows.after)
-    found: list[tuple[float, Coupling]] = []
+    found: list[tuple[float, Mutex]] = []
     for channel in (c for c, k in enumerate(cardinalities) if k == 2):
         count = after[:, channel].sum(axis=(1, 2))
         if len(count) and (count == 1).all() and (before[:, channel].sum(axis=(1, 2)) == 1).all():
-            found.append((np.inf, Coupling(channel, WHOLE, 0, True)))
+            found.append((np.inf, Mutex(channel, WHOLE, 0, True)))
             continue
         for kind, axis, length in ((WHOLE, (1, 2), 1), (ROW, (2,), board.height), (COLUMN, (1,), board.width)):
             p = ones[:, channel]
@@ -181,12 +193,12 @@ def find_couplings(
             alone = after[:, channel].sum(axis=axis, dtype=np.int64).reshape(len(rows), -1).max(axis=0, initial=0) <= 1
             for i in np.flatnonzero(alone & (expected > TOGETHER)):
                 line = int(i) if i < (length + 1) // 2 else int(i) - length
-                found.append((float(expected[i]), Coupling(channel, kind, line, False)))
+                found.append((float(expected[i]), Mutex(channel, kind, line, False)))
     found.sort(key=lambda entry: -entry[0])
-    return tuple(coupling for _, coupling in found)
+    return tuple(mutex for _, mutex in found)
 
 
-IMAGINED_STEPS = 5
+SIMULATED_STEPS = 5
 """Steps of imagined play that show which laws would be broken."""
 
 LARGEST_RADIUS = 3
@@ -230,16 +242,16 @@ class LocalGraphModel(DecisionGraphModel):
     def _forget(self, cards: tuple[int, ...], reach: Reach) -> None:
         """Knows nothing, but how far neighbourhoods reach."""
         self.reach = reach
-        columns = relative_columns(cards, self.parts, reach)
+        features = relative_features(cards, self.parts, reach)
         none = np.zeros(0, dtype=np.int64)
-        nothing = [habit_of(k, self.acts.n_ways, none, none, none) for k in (*cards, 2, 2)]
-        graphs = build(channel_layout(cards, self.acts), (), (), nothing, 1e-9)
-        self.local = LocalGraphs(graphs, nothing_late(graphs), columns, cards, self.acts, ())
+        nothing = [smoothing_of(k, self.encoding.n_action_classes, none, none, none) for k in (*cards, 2, 2)]
+        graphs = build(channel_layout(cards, self.encoding), (), (), nothing, 1e-9)
+        self.local = LocalGraphs(graphs, no_synchronic(graphs), features, cards, self.encoding, ())
         self._instantiate((), ())
 
     def _instantiate(self, asked: tuple[Question, ...], found: tuple[Search, ...]) -> None:
-        layout, graphs, late = instantiate(self.local, self.board)
-        self.fitted = Fitted(layout, graphs, late, graphs, False, asked, found)
+        layout, graphs, synchronic = instantiate(self.local, self.board)
+        self.fitted = Fitted(layout, graphs, synchronic, graphs, False, asked, found)
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel."""
@@ -254,10 +266,10 @@ class LocalGraphModel(DecisionGraphModel):
             progress(0.5)
         exact, (variables, calibration) = self._exact_match(held_out), self._described(held_out)
         self._learn(rows, jointly, since)
-        self._keep_laws(rows)
+        self._enforce_invariants(rows)
         if progress is not None:
             progress(1.0)
-        figures = {"nodes": float(len(self.local.graphs.column)), "couplings": float(len(self.local.couplings))}
+        figures = {"nodes": float(len(self.local.graphs.feature)), "couplings": float(len(self.local.mutexes))}
         figures |= {"changed": float((since > 0).sum()), "searched": float(self.searched)}
         figures["left out"] = float(len(rows) - self.counted)
         report = self._report((len(rows), len(held_out)), likelihood, exact, figures)
@@ -271,10 +283,10 @@ class LocalGraphModel(DecisionGraphModel):
         found = []
         for channel in channels:
             factors = tuple(int(f) for f in self.fitted.layout.cells[channel].ravel())
-            columns = asked_columns(self.local.graphs, channel) | asked_columns(self.local.late, channel)
-            names = dict.fromkeys(named_column(self.local.columns[d]) for d in sorted(columns))
-            layout = channel_layout(self.local.cardinalities, self.acts)
-            if hangs_on_action(self.local.graphs, channel, layout):
+            features = tested_features(self.local.graphs, channel) | tested_features(self.local.synchronic, channel)
+            names = dict.fromkeys(feature_name(self.local.features[d]) for d in sorted(features))
+            layout = channel_layout(self.local.cardinalities, self.encoding)
+            if depends_on_action(self.local.graphs, channel, layout):
                 names = {"action": None, **{name: None for name in names if not name.startswith("action ")}}
             found.append(Variable(f"channel {channel}", factors, tuple(names)))
         return found
@@ -285,13 +297,13 @@ class LocalGraphModel(DecisionGraphModel):
     def _with_memory(self, space: FactoredSpace) -> DecisionGraphModel:
         return LocalGraphModel(space, self.n_actions, self.reach, parts=self.parts)
 
-    def _since(self, rows: TransitionBatch, events: Bools) -> Ints:
+    def _since(self, rows: TransitionBatch, resets: Bools) -> Ints:
         """First row that tells of each channel, and of ``terminated``, as it is now."""
-        return still_true_since(rows, len(self.local.cardinalities) + 1, self._channels_foretold)
+        return last_changes(rows, len(self.local.cardinalities) + 1, self._channel_log_probs)
 
-    def _channels_foretold(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
+    def _channel_log_probs(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
         """As for factors, summed over each channel, [T, C + 1]."""
-        each = self._factors_foretold(train, tests)
+        each = self._factor_log_probs(train, tests)
         cells = self.board.to_planes(each[:, :-1]).sum(axis=(2, 3))
         return np.concatenate([cells, each[:, -1:]], axis=1)
 
@@ -324,42 +336,46 @@ class LocalGraphModel(DecisionGraphModel):
     def _reaching(self, reach: Reach, train: TransitionBatch, tests: TransitionBatch) -> Floats:
         """Log-probabilities of transitions after learning from others."""
         self._forget(self.local.cardinalities, reach)
-        return self._foretold(train, tests)
+        return self._quick_log_probs(train, tests)
 
     def _learn(self, rows: TransitionBatch, jointly: bool = True, since: Ints | None = None, in_pairs: bool = True) -> None:
         """Graphs first, each cell for itself; then what is never on together, and what hangs on what others become."""
         local = self.local
-        planes = PlaneTable(rows, self.board, local.cardinalities, local.columns, self.acts, since, in_pairs)
+        planes = PlaneTable(rows, self.board, local.cardinalities, local.features, self.encoding, since, in_pairs)
         self.searched, self.counted = len(planes.rows), len(planes.every_action)
-        graphs, asked, found = learn_channels(planes)
-        self.local = replace(local, graphs=graphs, late=nothing_late(graphs), couplings=(), laws=LAWLESS)
+        graphs, asked, found = fit_channels(planes)
+        self.local = replace(local, graphs=graphs, synchronic=no_synchronic(graphs), mutexes=(), invariants=NO_INVARIANTS)
         self._instantiate((), ())
         some = thinned(rows, SOME_ROWS)
-        couplings = find_couplings(rows, self.board, local.cardinalities, some, self._ones(some))
-        self.local = replace(self.local, couplings=couplings)
-        layout = with_couplings(self.fitted.layout, couplings)
+        mutexes = find_mutexes(rows, self.board, local.cardinalities, some, self._ones(some))
+        self.local = replace(self.local, mutexes=mutexes)
+        layout = with_mutexes(self.fitted.layout, mutexes)
         self.fitted = replace(self.fitted, layout=layout, asked=tuple(asked), found=tuple(found))
         if not jointly:
             return
-        late, more_asked, more_found = learn_late(planes, layout, self.fitted.usual)
-        if len(late.changing):
-            self.local = replace(self.local, late=late)
+        synchronic, more_asked, more_found = fit_synchronic(planes, layout, self.fitted.usual)
+        if len(synchronic.changing):
+            self.local = replace(self.local, synchronic=synchronic)
             self._instantiate((*asked, *more_asked), (*found, *more_found))
 
-    def _keep_laws(self, rows: TransitionBatch) -> None:
+    def _enforce_invariants(self, rows: TransitionBatch) -> None:
         """Keeps to laws of the transitions that imagined play would break."""
-        laws, layout, rng = find_laws(rows, self.board, self.local.cardinalities), self.fitted.layout, np.random.default_rng(0)
-        each = [*(LAWLESS._replace(counts=laws.counts[k : k + 1]) for k in range(len(laws.counts)))]
-        each += [LAWLESS._replace(met=laws.met)]
+        invariants, layout, rng = (
+            find_invariants(rows, self.board, self.local.cardinalities),
+            self.fitted.layout,
+            np.random.default_rng(0),
+        )
+        each = [*(NO_INVARIANTS._replace(counts=invariants.counts[k : k + 1]) for k in range(len(invariants.counts)))]
+        each += [NO_INVARIANTS._replace(met=invariants.met)]
         broken, states = np.zeros(len(each), dtype=np.bool_), thinned(rows, SOME_ROWS).states
-        for _ in range(0 if laws.none else IMAGINED_STEPS):
+        for _ in range(0 if invariants.none else SIMULATED_STEPS):
             following, over = self.sample(states, rng.integers(self.n_actions, size=len(states)), rng)
-            for i, law in enumerate(each):
-                broken[i] |= not (over | all_kept(*law, layout.weights, layout.cells, states, following)).all()
+            for i, invariant in enumerate(each):
+                broken[i] |= not (over | all_kept(*invariant, layout.weights, layout.cells, states, following)).all()
             states = following[~over]
-        laws = Laws(laws.counts[broken[:-1]], laws.met if broken[-1] else LAWLESS.met)
-        self.local = replace(self.local, laws=laws)
-        self.fitted = replace(self.fitted, layout=with_laws(layout, laws))
+        invariants = Invariants(invariants.counts[broken[:-1]], invariants.met if broken[-1] else NO_INVARIANTS.met)
+        self.local = replace(self.local, invariants=invariants)
+        self.fitted = replace(self.fitted, layout=with_invariants(layout, invariants))
 
     def _ones(self, rows: TransitionBatch) -> Floats:
         """Probability of each cell's value 1, [N, C, H, W]."""
@@ -390,10 +406,10 @@ class LocalGraphModel(DecisionGraphModel):
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """See TransitionModel."""
-        couplings = np.asarray(self.local.couplings, dtype=np.int64).reshape(-1, 4)
-        state: dict[str, NDArray[Any]] = {"reach": np.asarray(self.reach, dtype=np.int64), "couplings": couplings}
-        state |= self.local.laws._asdict()
-        for name, graphs in (("local", self.local.graphs), ("late", self.local.late)):
+        mutexes = np.asarray(self.local.mutexes, dtype=np.int64).reshape(-1, 4)
+        state: dict[str, NDArray[Any]] = {"reach": np.asarray(self.reach, dtype=np.int64), "couplings": mutexes}
+        state |= self.local.invariants._asdict()
+        for name, graphs in (("local", self.local.graphs), ("late", self.local.synchronic)):
             state.update({f"{name}.{part}": array for part, array in to_arrays(graphs).items()})
         return state
 
@@ -411,30 +427,30 @@ class LocalGraphModel(DecisionGraphModel):
         if len(parts) != 2 or parts[0] not in range(1, LARGEST_RADIUS + 1) or parts[1] not in (0, 1):
             raise ValueError("These weights are of neighbourhoods that reach as far as none can; the file is damaged.")
         reach = Reach(int(parts[0]), bool(parts[1]))
-        columns = relative_columns(cards, self.parts, reach)
-        graphs, late = (
+        features = relative_features(cards, self.parts, reach)
+        graphs, synchronic = (
             from_arrays(
                 {part: state[f"{name}.{part}"] for part in SAVED},
-                channel_layout(cards, self.acts),
-                len(columns),
+                channel_layout(cards, self.encoding),
+                len(features),
             )
             for name in ("local", "late")
         )
-        if not _sound(graphs, late, columns):
+        if not _sound(graphs, synchronic, features):
             raise ValueError("These weights ask for a next state that is not known yet; load them as they were saved.")
-        couplings = tuple(Coupling(int(c), int(k), int(i), bool(e)) for c, k, i, e in table_of(state["couplings"], 4))
+        mutexes = tuple(Mutex(int(c), int(k), int(i), bool(e)) for c, k, i, e in table_of(state["couplings"], 4))
         height, width = self.board.height, self.board.width
         if any(
             c.channel not in range(len(cards)) or cards[c.channel] != 2 or c.kind not in (0, 1, 2) or not c.lies_on(height, width)
-            for c in couplings
+            for c in mutexes
         ):
             raise ValueError("These weights couple cells that these planes do not have; load them into a model of the same kind.")
-        laws = Laws(table_of(state["counts"], 2), np.array(state["met"], dtype=np.bool_).reshape(-1))
-        if any(c not in range(len(cards)) or value not in range(cards[c]) for c, value in laws.counts) or (
-            len(laws.met) not in (0, n_combinations(cards))
+        invariants = Invariants(table_of(state["counts"], 2), np.array(state["met"], dtype=np.bool_).reshape(-1))
+        if any(c not in range(len(cards)) or value not in range(cards[c]) for c, value in invariants.counts) or (
+            len(invariants.met) not in (0, n_combinations(cards))
         ):
             raise ValueError("These weights count values that these planes do not have; load them into a model of the same kind.")
-        self.local, self.reach = LocalGraphs(graphs, late, columns, cards, self.acts, couplings, laws), reach
+        self.local, self.reach = LocalGraphs(graphs, synchronic, features, cards, self.encoding, mutexes, invariants), reach
         self._instantiate((), ())
 
 
@@ -446,11 +462,13 @@ def channel_cardinalities(space: FactoredSpace) -> tuple[int, ...] | None:
     return tuple(int(k) for k in cells[:, 0, 0]) if alike else None
 
 
-def _sound(graphs: Graphs, late: Graphs, columns: Ints) -> bool:
+def _sound(graphs: Graphs, synchronic: Graphs, features: Ints) -> bool:
     """Whether only late graphs ask for the next state."""
-    asked = graphs.column[graphs.column >= 0]
-    channels = columns[columns[:, 0] == NEXT, 1]
-    return bool(not np.isin(columns[asked, 0], (NEXT, NEXT_MEETING)).any() and (late.changing <= channels.max() + 1).all())
+    asked = graphs.feature[graphs.feature >= 0]
+    channels = features[features[:, 0] == NEXT, 1]
+    return bool(
+        not np.isin(features[asked, 0], (NEXT, NEXT_ADJACENCY)).any() and (synchronic.changing <= channels.max() + 1).all()
+    )
 
 
 MOST_CELLS = 2000
@@ -475,7 +493,7 @@ class PlaneGraphModel(LocalGraphModel):
         train, held_out = self._parts
         del self._parts
         recent = _later_half(train), _later_half(held_out)  # what hung on the place may have changed unseen by one rule for all
-        if any(self._hangs_on_place(*parts, report.predictor_loss) for parts in ((train, held_out), recent)):
+        if any(self._depends_on_position(*parts, report.predictor_loss) for parts in ((train, held_out), recent)):
             flat = DecisionGraphModel(self.cardinalities, self.n_actions, self.validation, self.parts)
             other = flat.fit(data, seed=seed)
             if _loss(other) < _loss(report):
@@ -492,7 +510,7 @@ class PlaneGraphModel(LocalGraphModel):
         self._parts = train.select(np.arange(train_since.max(), len(train))), held_out  # as the rules are now
         return train, held_out, train_since
 
-    def _hangs_on_place(self, train: TransitionBatch, held_out: TransitionBatch, loss: float | None) -> bool:
+    def _depends_on_position(self, train: TransitionBatch, held_out: TransitionBatch, loss: float | None) -> bool:
         """Whether a quick look at each cell for itself foretells held-out transitions better than what was learned of all.
 
         Args:
@@ -504,7 +522,7 @@ class PlaneGraphModel(LocalGraphModel):
         if loss is None or loss < -FORETOLD or len(self.cardinalities) > MOST_CELLS or min(len(some), len(tests)) < 2:
             return False
         flat = DecisionGraphModel(self.cardinalities, self.n_actions, parts=self.parts)
-        flat.fitted = fit_graphs(self.cardinalities, self.acts, some, np.zeros(len(some), dtype=np.bool_), False, False)
+        flat.fitted = fit_graphs(self.cardinalities, self.encoding, some, np.zeros(len(some), dtype=np.bool_), False, False)
         logs = flat.log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
         return better(np.maximum(logs, IMPOSSIBLE), np.full(len(logs), -loss))
 

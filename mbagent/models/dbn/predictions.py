@@ -6,17 +6,17 @@ import numpy as np
 
 from mbagent.models.base import BaseTransitionModel
 from mbagent.models.dbn import sampling
-from mbagent.models.dbn.affected_variables import Lean
+from mbagent.models.dbn.affected_variables import AffectedIndex
 from mbagent.models.dbn.arrays import Graphs
-from mbagent.models.dbn.fitting import Fitted, for_planning, nothing_late
-from mbagent.models.dbn.invariants import COVERING, MOST_TRIES, Laws, all_kept, kept_chances, lawful
-from mbagent.models.dbn.successors import WholeKernel, event_draws, kernel_of, mixed, successors
+from mbagent.models.dbn.fitting import Fitted, for_planning, no_synchronic
+from mbagent.models.dbn.invariants import COVERING, MOST_TRIES, Invariants, all_kept, enforced, kept_chances
+from mbagent.models.dbn.successors import WholeKernel, kernel_of, mixed, reset_draws, successors
 from mbagent.models.protocol import Successors, as_keys
 from mbagent.models.systematic_sampling import assemble, rows_at_once, start
 from mbagent.types import Actions, Bools, Floats, Ints, Keys, Randomness, States
 from mbagent_envs.random_keys import derive, uniforms
 
-_EVENT = 1 << 33
+_RESET = 1 << 33
 """Salt of the random number that decides whether the event happens."""
 
 _AGAIN = 1 << 34
@@ -32,9 +32,9 @@ class GraphPredictions(BaseTransitionModel):
 
     fitted: Fitted
     _planned: tuple[Fitted, Fitted] | None = None
-    _kernel: tuple[Fitted, Lean | WholeKernel] | None = None
+    _kernel: tuple[Fitted, AffectedIndex | WholeKernel] | None = None
 
-    def kernel(self) -> Lean | WholeKernel:
+    def kernel(self) -> AffectedIndex | WholeKernel:
         """The graphs for compiled search, see ``compiled_model.py``."""
         if self._kernel is None or self._kernel[0] is not self.fitted:
             self._kernel = self.fitted, kernel_of(self._for_planning(), self.cardinalities)
@@ -46,12 +46,12 @@ class GraphPredictions(BaseTransitionModel):
         return self._planned[1]
 
     @property
-    def _laws(self) -> Laws:
-        return Laws(self.fitted.layout.counts, self.fitted.layout.met)
+    def _invariants(self) -> Invariants:
+        return Invariants(self.fitted.layout.counts, self.fitted.layout.met)
 
     @property
     def _cells(self) -> tuple[Ints, Ints]:
-        """What the laws are about: see ``laws.keeps``."""
+        """What the laws are about: see ``invariants.keeps``."""
         return self.fitted.layout.weights, self.fitted.layout.cells
 
     def _rows(self, states: States, actions: Actions) -> tuple[States, Actions]:
@@ -63,10 +63,10 @@ class GraphPredictions(BaseTransitionModel):
             )
         return states, actions
 
-    def _event_rates(self, states: States, actions: Actions) -> Floats:
-        if not self.fitted.has_event:
+    def _reset_rates(self, states: States, actions: Actions) -> Floats:
+        if not self.fitted.has_reset:
             return np.zeros(len(states))
-        rates: Floats = sampling.event_rates(states, actions, self.fitted.layout, self.fitted.usual)
+        rates: Floats = sampling.reset_rates(states, actions, self.fitted.layout, self.fitted.usual)
         return rates
 
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
@@ -74,8 +74,8 @@ class GraphPredictions(BaseTransitionModel):
         states, actions = self._rows(states, actions)
         keys = as_keys(rng, len(states))
         following, over = self._draw(states, actions, keys)
-        for again in range(0 if self._laws.none else MOST_TRIES):
-            wrong = np.flatnonzero(~over & ~all_kept(*self._laws, *self._cells, states, following))
+        for again in range(0 if self._invariants.none else MOST_TRIES):
+            wrong = np.flatnonzero(~over & ~all_kept(*self._invariants, *self._cells, states, following))
             if len(wrong) == 0:
                 break
             redrawn, ends = self._draw(states[wrong], actions[wrong], derive(keys[wrong], _AGAIN + again))
@@ -85,14 +85,14 @@ class GraphPredictions(BaseTransitionModel):
     def _draw(self, states: States, actions: Actions, keys: Keys, greedy: bool = False) -> tuple[States, Bools]:
         """Draws by keys, or takes the likeliest value of each unit."""
         fitted, following, over = self.fitted, states.copy(), np.zeros(len(states), dtype=np.bool_)
-        sampling.sample(states, actions, keys, greedy, fitted.layout, fitted.usual, fitted.late, following, over)
-        luck = 0.5 if greedy else uniforms(derive(keys, _EVENT), 1)[:, 0]
-        happens = np.flatnonzero(luck < self._event_rates(states, actions))
+        sampling.sample(states, actions, keys, greedy, fitted.layout, fitted.usual, fitted.synchronic, following, over)
+        uniform = 0.5 if greedy else uniforms(derive(keys, _RESET), 1)[:, 0]
+        happens = np.flatnonzero(uniform < self._reset_rates(states, actions))
         if len(happens):
-            given, event = states[happens], fitted.event
+            given, reset = states[happens], fitted.reset
             redrawn, ends = given.copy(), np.zeros(len(happens), dtype=np.bool_)
-            late = nothing_late(event)
-            sampling.sample(given, actions[happens], keys[happens], greedy, fitted.layout, event, late, redrawn, ends)
+            synchronic = no_synchronic(reset)
+            sampling.sample(given, actions[happens], keys[happens], greedy, fitted.layout, reset, synchronic, redrawn, ends)
             following[happens], over[happens] = redrawn, ends
         return following, over
 
@@ -107,62 +107,64 @@ class GraphPredictions(BaseTransitionModel):
         start = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64)
         fitted, probs = self.fitted, np.empty((len(states), int(start[-1])))
         sampling.marginals(states, actions, fitted.layout, fitted.usual, start, probs)
-        if fitted.has_event:
-            rate, redrawn = self._event_rates(states, actions)[:, None], np.empty_like(probs)
-            sampling.marginals(states, actions, fitted.layout, fitted.event, start, redrawn)
+        if fitted.has_reset:
+            rate, redrawn = self._reset_rates(states, actions)[:, None], np.empty_like(probs)
+            sampling.marginals(states, actions, fitted.layout, fitted.reset, start, redrawn)
             probs += rate * (redrawn - probs)
         return probs
 
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
         """See TransitionModel; exact for the distribution that ``sample`` draws from.
 
-        Where there are laws (see ``laws.py``), the chance that all are kept is estimated from systematic draws.
+        Where there are laws (see ``invariants.py``), the chance that all are kept is estimated from systematic draws.
         """
         states, actions = self._rows(states, actions)
         following, over = np.ascontiguousarray(next_states, dtype=np.int64), np.ascontiguousarray(terminated, dtype=np.bool_)
         layout = self.fitted.layout
-        usual: Floats = sampling.log_prob(states, actions, following, over, layout, self.fitted.usual, self.fitted.late)
-        if not self._laws.none:
+        usual: Floats = sampling.log_prob(states, actions, following, over, layout, self.fitted.usual, self.fitted.synchronic)
+        if not self._invariants.none:
             planned = self._for_planning()
-            found = self._successors(states, actions, planned.usual, planned.late, COVERING, 0)
-            kept = all_kept(*self._laws, *self._cells, states, following)
-            chances = kept_chances(self._laws, *self._cells, states, found)
+            found = self._successors(states, actions, planned.usual, planned.synchronic, COVERING, 0)
+            kept = all_kept(*self._invariants, *self._cells, states, following)
+            chances = kept_chances(self._invariants, *self._cells, states, found)
             usual[~over] = np.where(kept, usual - np.log(chances), -np.inf)[~over]
-        if not self.fitted.has_event:
+        if not self.fitted.has_reset:
             return usual
-        rate = self._event_rates(states, actions)
-        event = sampling.log_prob(states, actions, following, over, layout, self.fitted.event, nothing_late(self.fitted.event))
+        rate = self._reset_rates(states, actions)
+        reset = sampling.log_prob(states, actions, following, over, layout, self.fitted.reset, no_synchronic(self.fitted.reset))
         with np.errstate(divide="ignore"):
-            return np.logaddexp(np.log1p(-rate) + usual, np.log(rate) + event)
+            return np.logaddexp(np.log1p(-rate) + usual, np.log(rate) + reset)
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
         """See TransitionModel; see ``models/particles.py``."""
         states, actions = self._rows(states, actions)
         planned = self._for_planning()
-        if not self.fitted.has_event:
-            usual = self._successors(states, actions, planned.usual, planned.late, n_samples, seed)
-            return lawful(self._laws, *self._cells, states, usual)
-        rates: Floats = sampling.event_rates(states, actions, planned.layout, planned.usual)
-        n_events = np.array([event_draws(rate, n_samples) for rate in rates], dtype=np.int64)
-        parts, late = [], nothing_late(planned.event)
-        for n in np.unique(n_events):
-            some = np.flatnonzero((n_events == n) & (rates < 1.0))
-            found = self._successors(states[some], actions[some], planned.usual, planned.late, max(1, n_samples - int(n)), seed)
+        if not self.fitted.has_reset:
+            usual = self._successors(states, actions, planned.usual, planned.synchronic, n_samples, seed)
+            return enforced(self._invariants, *self._cells, states, usual)
+        rates: Floats = sampling.reset_rates(states, actions, planned.layout, planned.usual)
+        n_resets = np.array([reset_draws(rate, n_samples) for rate in rates], dtype=np.int64)
+        parts, synchronic = [], no_synchronic(planned.reset)
+        for n in np.unique(n_resets):
+            some = np.flatnonzero((n_resets == n) & (rates < 1.0))
+            found = self._successors(
+                states[some], actions[some], planned.usual, planned.synchronic, max(1, n_samples - int(n)), seed
+            )
             parts.append((some, 1.0 - rates[some], found))
             if n > 0:
-                some = np.flatnonzero(n_events == n)
-                found = self._successors(states[some], actions[some], planned.event, late, int(n), seed)
+                some = np.flatnonzero(n_resets == n)
+                found = self._successors(states[some], actions[some], planned.reset, synchronic, int(n), seed)
                 parts.append((some, rates[some], found))
         return mixed(parts, len(states))
 
     def _successors(
-        self, states: States, actions: Actions, graphs: Graphs, late: Graphs, n_samples: int, seed: int
+        self, states: States, actions: Actions, graphs: Graphs, synchronic: Graphs, n_samples: int, seed: int
     ) -> Successors:
         key, offset = start(seed)
         layout, n_outputs = self.fitted.layout, states.shape[1] + 1
         step = rows_at_once(n_samples, n_outputs)
         parts = [
-            successors(states[b : b + step], actions[b : b + step], layout, graphs, late, (n_samples, key, offset))
+            successors(states[b : b + step], actions[b : b + step], layout, graphs, synchronic, (n_samples, key, offset))
             for b in range(0, len(states), step)
         ]
         return assemble(parts, n_outputs)

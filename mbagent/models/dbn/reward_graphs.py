@@ -14,17 +14,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.data import TransitionBatch
-from mbagent.models.dbn.arrays import Nodes, meets
-from mbagent.models.dbn.features import Layout, Seen, acts_of, ask, column_kinds, distinct, lay_out, shown_acts
+from mbagent.models.dbn.arrays import Nodes, are_adjacent
+from mbagent.models.dbn.features import (
+    Layout,
+    Observed,
+    action_encoding,
+    action_feature_table,
+    ask,
+    distinct,
+    feature_kinds,
+    make_layout,
+)
 from mbagent.models.dbn.leaf_prior import best_prior
-from mbagent.models.dbn.plane_features import MEETING, NEXT_MEETING, Reach, far_value, known_columns, relative_columns
+from mbagent.models.dbn.plane_features import ADJACENCY, NEXT_ADJACENCY, Reach, far_value, informative_features, relative_features
 from mbagent.models.dbn.split_search import find_splits
 from mbagent.spaces import PlaneLayout
 from mbagent.types import Bools, Floats, Ints
 from mbagent_envs.jit import compiled, inlined
 
-SHOWN, NEXT_SHOWN, ACT, MEETS, NEXT_MEETS = range(5)
-"""Kinds of columns: a factor's value lies from one to another, now or next; an action has it; see ``units.Layout.meetings``."""
+SHOWN, NEXT_SHOWN, ACTION_PART, MEETS, NEXT_MEETS = range(5)
+"""Kinds of columns: a factor's value lies from one to another, now or next; an action has it; see ``features.Layout.adjacencies``."""
 
 MOST_ENTRIES = 50_000_000
 """Rows times columns that are searched; of more rows, all of rare classes and evenly chosen others are, up to half each."""
@@ -33,31 +42,35 @@ MOST_SINGLE = 4000
 """On planes with more columns of single cells than that, only what meets what is asked for."""
 
 
+SAVED_CLASSES = ("columns", "cells", "ways", "acts", "classes", "first", "node", "rate")
+"""Names in files of the fields of ClassGraphs, in their order."""
+
+
 class ClassGraphs(NamedTuple):
     """The graphs, as arrays.
 
     Attributes:
-        columns: kind and up to six parts, int64 [D, 7].
+        features: kind and up to six parts, int64 [D, 7].
         cells: factor of each channel's cells, int64 [C, H, W]; empty without planes.
-        ways: the number under which each action is counted, int64 [A].
-        acts: which action columns are on, bool [A, columns].
+        action_classes: the number under which each action is counted, int64 [A].
+        encoding: which action columns are on, bool [A, columns].
         classes: class of each graph, int64 [J].
         first: first node of each graph and way, -1 where the class never came under it, int64 [J, W].
         node: column (-1 at a leaf), and the next node where it is off and on, int64 [nodes, 3]; those come before.
         rate: probability of the class at a leaf, [nodes].
     """
 
-    columns: Ints
+    features: Ints
     cells: Ints
-    ways: Ints
-    acts: Bools
+    action_classes: Ints
+    encoding: Bools
     classes: Ints
     first: Ints
     node: Ints
     rate: Floats
 
 
-def learn_classes(
+def fit_classes(
     rows: TransitionBatch, classes: Ints, cardinalities: Sequence[int], parts: Sequence[int], planes: PlaneLayout | None
 ) -> ClassGraphs:
     """Learns what the class of a transition hangs on.
@@ -69,7 +82,7 @@ def learn_classes(
         parts: number of values of each part of an action.
         planes: where cells lie, where factors form planes.
     """
-    acts, layout = acts_of(parts), lay_out(cardinalities, (), acts_of(parts), ordinal=planes is None)
+    encoding, layout = action_encoding(parts), make_layout(cardinalities, (), action_encoding(parts), ordinal=planes is None)
     candidates = _candidates(rows, layout, cardinalities, parts, planes)
     chosen = _chosen(classes, max(1, MOST_ENTRIES // max(len(candidates), 1)))
     some, kinds = rows.select(chosen), _kinds(rows, layout, candidates)
@@ -78,17 +91,20 @@ def learn_classes(
     nothing, nodes = np.zeros(len(some), dtype=np.int64), Nodes()
     present = [int(k) for k in np.unique(classes) if k > 0]
     asked = [
-        ask(0, 2, Seen(pattern, acts.way[some.actions], nothing, (classes[chosen] == k).astype(np.int64)))[0] for k in present
+        ask(0, 2, Observed(pattern, encoding.action_class[some.actions], nothing, (classes[chosen] == k).astype(np.int64)))[0]
+        for k in present
     ]
-    found = find_splits([question.head for question in asked], table, kinds, acts.n_ways)
-    begins = np.full((len(asked), acts.n_ways), -1, dtype=np.int64)
+    found = find_splits([question.target for question in asked], table, kinds, encoding.n_action_classes)
+    begins = np.full((len(asked), encoding.n_action_classes), -1, dtype=np.int64)
     for j, (question, search) in enumerate(zip(asked, found, strict=True)):
         begins[j, question.pairs // 2] = nodes.graph(search, best_prior(found))
     links = np.asarray(nodes.links, dtype=np.int64).reshape(-1, 3)
     used, number = np.unique(links[:, 0][links[:, 0] >= 0], return_inverse=True)
     links[links[:, 0] >= 0, 0] = number
-    switches, cells = shown_acts(acts, np.arange(len(acts.way))), cells_in(planes, len(cardinalities))
-    graphs = ClassGraphs(candidates[used], cells, acts.way, switches, np.asarray(present), begins, links, _rates(nodes))
+    switches, cells = action_feature_table(encoding, np.arange(len(encoding.action_class))), cells_in(planes, len(cardinalities))
+    graphs = ClassGraphs(
+        candidates[used], cells, encoding.action_class, switches, np.asarray(present), begins, links, _rates(nodes)
+    )
     return graphs._replace(rate=_counted(graphs, rows, classes))
 
 
@@ -122,32 +138,32 @@ def _candidates(
     """Columns that may tell something, int64 [D, 7]."""
     single = np.zeros((len(layout.factor), 7), dtype=np.int64)
     single[:, 1:4] = np.stack([layout.factor, layout.value, layout.top], axis=1)
-    acts = np.zeros((layout.acts.n_columns, 7), dtype=np.int64)
-    acts[:, 0], acts[:, 1] = ACT, np.arange(layout.acts.n_columns)
+    encoding = np.zeros((layout.encoding.n_features, 7), dtype=np.int64)
+    encoding[:, 0], encoding[:, 1] = ACTION_PART, np.arange(layout.encoding.n_features)
     following = single.copy()
     following[:, 0] = NEXT_SHOWN
-    told = [_varying(single, rows.before), _varying(following, rows.after)]
+    determined = [_varying(single, rows.before), _varying(following, rows.after)]
     if planes is None:
-        return np.concatenate([*told, acts])
+        return np.concatenate([*determined, encoding])
     each = planes.to_planes(np.asarray(cardinalities)[None])[0]
-    relative = relative_columns(tuple(int(k) for k in each[:, 0, 0]), parts, Reach())
-    relative = relative[known_columns(relative, planes.to_planes(rows.before), planes.to_planes(rows.after))]
-    meetings = relative[np.isin(relative[:, 0], (MEETING, NEXT_MEETING))]
-    meetings[:, 0] = np.where(meetings[:, 0] == MEETING, MEETS, NEXT_MEETS)
-    told = told if sum(map(len, told)) <= MOST_SINGLE else []
-    return np.concatenate([*told, acts, meetings])
+    relative = relative_features(tuple(int(k) for k in each[:, 0, 0]), parts, Reach())
+    relative = relative[informative_features(relative, planes.to_planes(rows.before), planes.to_planes(rows.after))]
+    adjacencies = relative[np.isin(relative[:, 0], (ADJACENCY, NEXT_ADJACENCY))]
+    adjacencies[:, 0] = np.where(adjacencies[:, 0] == ADJACENCY, MEETS, NEXT_MEETS)
+    determined = determined if sum(map(len, determined)) <= MOST_SINGLE else []
+    return np.concatenate([*determined, encoding, adjacencies])
 
 
-def _varying(columns: Ints, states: NDArray[Any]) -> Ints:
+def _varying(features: Ints, states: NDArray[Any]) -> Ints:
     """Those columns whose factor is not the same everywhere."""
     varies = (states != states[:1]).any(axis=0)
-    told: Ints = columns[varies[columns[:, 1]]]
-    return told
+    determined: Ints = features[varies[features[:, 1]]]
+    return determined
 
 
 def _kinds(rows: TransitionBatch, layout: Layout, candidates: Ints) -> Ints:
     """Kind of each column: causes of one kind make others of that kind likelier, see ``find_splits``."""
-    of_single = column_kinds(layout, rows.before, (rows.before != rows.after).any(axis=0))
+    of_single = feature_kinds(layout, rows.before, (rows.before != rows.after).any(axis=0))
     number = {tuple(key): i for i, key in enumerate(np.stack([layout.factor, layout.value, layout.top], axis=1).tolist())}
     most, kinds = int(of_single.max(initial=0)) + 1, np.empty(len(candidates), dtype=np.int64)
     for d, (kind, *parts) in enumerate(candidates.tolist()):
@@ -163,13 +179,13 @@ def _values(rows: TransitionBatch, layout: Layout, candidates: Ints, planes: Pla
         here = np.flatnonzero(kind == which)
         values = states[:, candidates[here, 1]]
         table[:, here] = (values >= candidates[here, 2]) & (values <= candidates[here, 3])
-    table[:, kind == ACT] = shown_acts(layout.acts, rows.actions)
+    table[:, kind == ACTION_PART] = action_feature_table(layout.encoding, rows.actions)
     if planes is not None:
         before, after = planes.to_planes(rows.before), planes.to_planes(rows.after)
         for d in np.flatnonzero(np.isin(kind, (MEETS, NEXT_MEETS))):
-            column = candidates[d].copy()
-            column[0] = MEETING if kind[d] == MEETS else NEXT_MEETING
-            table[:, d] = far_value(column, before, rows.actions, after)
+            feature = candidates[d].copy()
+            feature[0] = ADJACENCY if kind[d] == MEETS else NEXT_ADJACENCY
+            table[:, d] = far_value(feature, before, rows.actions, after)
     return table
 
 
@@ -191,25 +207,25 @@ def _leaf(
     state: Ints,
     action: int,
     following: Ints,
-    columns: Ints,
+    features: Ints,
     cells: Ints,
-    acts: Bools,
+    encoding: Bools,
     nodes: Ints,
 ) -> int:
     """The leaf that a transition leads to from a node on, or -1. Takes arrays: to have them from a tuple each time costs more."""
     while node >= 0 and nodes[node, 0] >= 0:
-        column = nodes[node, 0]
-        kind = columns[column, 0]
-        if kind == ACT:
-            on = acts[action, columns[column, 1]]
+        feature = nodes[node, 0]
+        kind = features[feature, 0]
+        if kind == ACTION_PART:
+            on = encoding[action, features[feature, 1]]
         elif kind == SHOWN:
-            on = columns[column, 2] <= state[columns[column, 1]] <= columns[column, 3]
+            on = features[feature, 2] <= state[features[feature, 1]] <= features[feature, 3]
         elif kind == NEXT_SHOWN:
-            on = columns[column, 2] <= following[columns[column, 1]] <= columns[column, 3]
+            on = features[feature, 2] <= following[features[feature, 1]] <= features[feature, 3]
         elif kind == MEETS:
-            on = meets(state, cells, columns[column, 1:])
+            on = are_adjacent(state, cells, features[feature, 1:])
         else:
-            on = meets(following, cells, columns[column, 1:])
+            on = are_adjacent(following, cells, features[feature, 1:])
         node = nodes[node, 2] if on else nodes[node, 1]
     return int(node)
 
@@ -217,23 +233,25 @@ def _leaf(
 @compiled
 def leaves_of(graphs: ClassGraphs, j: int, states: Ints, actions: Ints, following: Ints) -> Ints:
     """Leaves of graph ``j`` that transitions [B] lead to, -1 for none."""
-    columns, cells, acts, nodes = graphs.columns, graphs.cells, graphs.acts, graphs.node
-    first, ways, result = graphs.first, graphs.ways, np.empty(len(actions), dtype=np.int64)
+    features, cells, encoding, nodes = graphs.features, graphs.cells, graphs.encoding, graphs.node
+    first, action_classes, result = graphs.first, graphs.action_classes, np.empty(len(actions), dtype=np.int64)
     for b in range(len(actions)):
-        result[b] = _leaf(first[j, ways[actions[b]]], states[b], actions[b], following[b], columns, cells, acts, nodes)
+        result[b] = _leaf(
+            first[j, action_classes[actions[b]]], states[b], actions[b], following[b], features, cells, encoding, nodes
+        )
     return result
 
 
 @compiled
 def class_chances(graphs: ClassGraphs, n_classes: int, states: Ints, actions: Ints, following: Ints) -> Floats:
     """Probability of each class of transitions [B, F], [B, K]; what graphs leave over is that of class 0."""
-    columns, cells, acts, nodes = graphs.columns, graphs.cells, graphs.acts, graphs.node
-    first, ways, classes, rate = graphs.first, graphs.ways, graphs.classes, graphs.rate
+    features, cells, encoding, nodes = graphs.features, graphs.cells, graphs.encoding, graphs.node
+    first, action_classes, classes, rate = graphs.first, graphs.action_classes, graphs.classes, graphs.rate
     result = np.zeros((len(actions), n_classes), dtype=np.float64)
     for b in range(len(actions)):
-        total, way = 0.0, ways[actions[b]]
+        total, action_class = 0.0, action_classes[actions[b]]
         for j in range(len(classes)):
-            leaf = _leaf(first[j, way], states[b], actions[b], following[b], columns, cells, acts, nodes)
+            leaf = _leaf(first[j, action_class], states[b], actions[b], following[b], features, cells, encoding, nodes)
             if leaf >= 0:
                 result[b, classes[j]] = rate[leaf]
                 total += rate[leaf]
@@ -253,32 +271,32 @@ def check_graphs(
         ValueError: they are not those of graphs of these factors, actions and classes.
     """
     wrong = "These weights are not those of a learned reward of this environment; the file is damaged, or of another one."
-    if set(state) != set(ClassGraphs._fields):
+    if set(state) != set(SAVED_CLASSES):
         raise ValueError(wrong)
     kinds = {"acts": np.bool_, "rate": np.float64}
-    g = ClassGraphs(*(np.ascontiguousarray(state[name], dtype=kinds.get(name, np.int64)) for name in ClassGraphs._fields))
-    shapes = (g.columns.ndim, g.acts.ndim, g.first.ndim, g.node.ndim, g.ways.ndim, g.classes.ndim, g.rate.ndim)
-    if shapes != (2, 2, 2, 2, 1, 1, 1) or g.columns.shape[1] != 7 or g.node.shape[1] != 3 or len(g.rate) != len(g.node):
+    g = ClassGraphs(*(np.ascontiguousarray(state[name], dtype=kinds.get(name, np.int64)) for name in SAVED_CLASSES))
+    shapes = (g.features.ndim, g.encoding.ndim, g.first.ndim, g.node.ndim, g.action_classes.ndim, g.classes.ndim, g.rate.ndim)
+    if shapes != (2, 2, 2, 2, 1, 1, 1) or g.features.shape[1] != 7 or g.node.shape[1] != 3 or len(g.rate) != len(g.node):
         raise ValueError(wrong)
-    kind, parts = g.columns[:, 0], g.columns[:, 1:]
-    single, meeting = np.isin(kind, (SHOWN, NEXT_SHOWN)), np.isin(kind, (MEETS, NEXT_MEETS))
+    kind, parts = g.features[:, 0], g.features[:, 1:]
+    single, adjacency = np.isin(kind, (SHOWN, NEXT_SHOWN)), np.isin(kind, (MEETS, NEXT_MEETS))
     inner, n = g.node[:, 0] >= 0, np.arange(len(g.node))
     sound = (
         g.cells.shape == cells.shape
         and (g.cells == cells).all()
-        and len(g.ways) == len(g.acts) == n_actions
-        and _within(g.ways, 0, g.first.shape[1])
+        and len(g.action_classes) == len(g.encoding) == n_actions
+        and _within(g.action_classes, 0, g.first.shape[1])
         and _within(g.classes, 1, n_classes)
         and len(g.first) == len(g.classes)
         and _within(g.first, -1, len(g.node))
-        and _within(g.node[:, 0], -1, len(g.columns))
+        and _within(g.node[:, 0], -1, len(g.features))
         and all(_within(g.node[inner, i], 0, len(g.node)) and (g.node[inner, i] < n[inner]).all() for i in (1, 2))
         and _within(kind, SHOWN, NEXT_MEETS + 1)
         and _within(parts[single, 0], 0, len(cardinalities))
-        and _within(parts[kind == ACT, 0], 0, g.acts.shape[1])
-        and _within(parts[meeting, 0], 0, len(cells))
-        and _within(parts[meeting, 2], -1, len(cells))
-        and bool((np.abs(parts[meeting, 4:6]) <= 1).all())
+        and _within(parts[kind == ACTION_PART, 0], 0, g.encoding.shape[1])
+        and _within(parts[adjacency, 0], 0, len(cells))
+        and _within(parts[adjacency, 2], -1, len(cells))
+        and bool((np.abs(parts[adjacency, 4:6]) <= 1).all())
         and bool(((g.rate >= 0.0) & (g.rate <= 1.0)).all())
     )
     if not sound:

@@ -1,6 +1,6 @@
 """Drawing from decision graphs, compiled: next states and probabilities.
 
-Units that ``late`` has graphs of are drawn after all others, given what those became (the paper's conditioner, section 3.2);
+Units that ``synchronic`` has graphs of are drawn after all others, given what those became (the paper's conditioner, section 3.2);
 only in rows where they are uncertain by themselves, but for whether the episode ended. Shapes: B batch, F factors, U units
 (the last two are ``terminated`` and the event), Q couplings, D columns, D' of them the state's.
 """
@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mbagent.models.dbn.arrays import Graphs, distributions, n_columns, read, show, show_next, show_next_meetings, write
+from mbagent.models.dbn.arrays import Graphs, distributions, n_features, read, show, show_next, show_next_adjacencies, write
 from mbagent.models.dbn.features import Layout
-from mbagent.models.dbn.mutex import couple, settle, which, widest
+from mbagent.models.dbn.mutex import mutex_distribution, settle, which, widest
 from mbagent.models.systematic_sampling import NEGLIGIBLE
 from mbagent.types import Bools, Floats, Ints, Keys
 from mbagent_envs.jit import compiled
@@ -44,12 +44,12 @@ class Work(NamedTuple):
 
 
 @compiled
-def work_space(layout: Layout, graphs: Graphs, late: Graphs) -> Work:
+def work_space(layout: Layout, graphs: Graphs, synchronic: Graphs) -> Work:
     """Room for a row."""
     still, later = np.ones(len(layout.outputs), dtype=np.bool_), np.zeros(len(layout.outputs), dtype=np.bool_)
-    still[graphs.changing], later[late.changing] = False, True
+    still[graphs.changing], later[synchronic.changing] = False, True
     return Work(
-        np.empty(n_columns(layout) + len(layout.factor) + len(layout.next_meetings), dtype=np.bool_),
+        np.empty(n_features(layout) + len(layout.factor) + len(layout.next_adjacencies), dtype=np.bool_),
         np.zeros(len(layout.outputs), dtype=np.int64),
         np.empty(graphs.start[-1], dtype=np.float64),
         still,
@@ -63,19 +63,19 @@ def work_space(layout: Layout, graphs: Graphs, late: Graphs) -> Work:
 def alone(layout: Layout, graphs: Graphs, later: Bools) -> Ints:
     """Units with graphs that are drawn each for itself, before those that are drawn late."""
     chosen = np.zeros(len(layout.outputs), dtype=np.bool_)
-    for unit in graphs.changing:
-        chosen[unit] = layout.coupling_of[unit] < 0 and not later[unit]
+    for variable in graphs.changing:
+        chosen[variable] = layout.mutex_of[variable] < 0 and not later[variable]
     return np.flatnonzero(chosen)
 
 
 @compiled
-def event_rates(states: Ints, actions: Ints, layout: Layout, graphs: Graphs) -> Floats:
+def reset_rates(states: Ints, actions: Ints, layout: Layout, graphs: Graphs) -> Floats:
     """Probability of the event, [B]."""
     w, rates = work_space(layout, graphs, graphs), np.empty(len(states), dtype=np.float64)
-    event = np.array([len(layout.outputs) - 1])
+    reset = np.array([len(layout.outputs) - 1])
     for b in range(len(states)):
         show(states[b], actions[b], layout, w.on)
-        distributions(event, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
+        distributions(reset, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
         rates[b] = w.rates[graphs.start[-1] - 1]
     return rates
 
@@ -103,7 +103,7 @@ def sample(
     greedy: bool,
     layout: Layout,
     graphs: Graphs,
-    late: Graphs,
+    synchronic: Graphs,
     following: Ints,
     terminated: Bools,
 ) -> None:
@@ -111,103 +111,103 @@ def sample(
 
     ``following`` holds a copy of ``states``; ``greedy`` takes the likeliest value each time instead.
     """
-    w, n_units = work_space(layout, graphs, late), len(layout.outputs)
+    w, n_variables = work_space(layout, graphs, synchronic), len(layout.outputs)
     early = alone(layout, graphs, w.later)
     for b in range(len(states)):
         show(states[b], actions[b], layout, w.on)
         distributions(graphs.changing, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
         terminated[b] = False
-        for unit in early:
-            u = -1.0 if greedy else uniform_at(keys[b], unit)
-            _draw(unit, u, w, layout, graphs, following[b], terminated, b)
+        for variable in early:
+            u = -1.0 if greedy else uniform_at(keys[b], variable)
+            _draw(variable, u, w, layout, graphs, following[b], terminated, b)
         for q in range(len(layout.exactly)):
-            n = couple(q, states[b], w.rates, w.still, layout, graphs, w.joint)
-            u = -1.0 if greedy else uniform_at(keys[b], n_units + q)
+            n = mutex_distribution(q, states[b], w.rates, w.still, layout, graphs, w.joint)
+            u = -1.0 if greedy else uniform_at(keys[b], n_variables + q)
             settle(following[b], q, _pick(w.joint, 0, n + 1, u, n), layout)
-        if len(late.changing):
+        if len(synchronic.changing):
             show_next(following[b], layout, w.on)
-        for i in range(len(late.changing)):
-            unit = late.changing[i]
-            if is_late(unit, actions[b], w, layout, graphs):
-                if unit == n_units - 2:
-                    show_next_meetings(following[b], layout, w.on)
-                distributions(late.changing[i : i + 1], states[b], actions[b], layout, late, w.on, w.values, w.rates)
-            u = -1.0 if greedy else uniform_at(keys[b], unit)
-            _draw(unit, u, w, layout, late, following[b], terminated, b)
-            _show_unit(unit, following[b], w, layout)
+        for i in range(len(synchronic.changing)):
+            variable = synchronic.changing[i]
+            if needs_synchronic(variable, actions[b], w, layout, graphs):
+                if variable == n_variables - 2:
+                    show_next_adjacencies(following[b], layout, w.on)
+                distributions(synchronic.changing[i : i + 1], states[b], actions[b], layout, synchronic, w.on, w.values, w.rates)
+            u = -1.0 if greedy else uniform_at(keys[b], variable)
+            _draw(variable, u, w, layout, synchronic, following[b], terminated, b)
+            _show_variable(variable, following[b], w, layout)
 
 
 @compiled
-def is_late(unit: int, action: int, w: Work, layout: Layout, graphs: Graphs) -> bool:
+def needs_synchronic(variable: int, action: int, w: Work, layout: Layout, graphs: Graphs) -> bool:
     """Whether a unit that has late graphs needs them here: of what may follow, more than one value was observed, or is likely.
 
     Args:
-        unit: its number.
+        variable: its number.
         action: the action.
         w: columns, present values and rates, as ``distributions`` left them.
         layout: the units.
         graphs: of each unit for itself.
     """
-    n = layout.outputs[unit]
-    if unit == len(layout.outputs) - 2 or settled(w.rates, graphs.start[unit], n) < 0:
+    n = layout.outputs[variable]
+    if variable == len(layout.outputs) - 2 or settled(w.rates, graphs.start[variable], n) < 0:
         return True
-    pair = graphs.pairs[unit] + layout.acts.way[action] * n + w.values[unit]
+    pair = graphs.pairs[variable] + layout.encoding.action_class[action] * n + w.values[variable]
     for entry in range(graphs.entries[pair], graphs.entries[pair + 1]):
         node = graphs.nodes[entry]
-        while graphs.column[node] >= 0:
-            node = graphs.on[node] if w.on[graphs.column[node]] else graphs.off[node]
+        while graphs.feature[node] >= 0:
+            node = graphs.on[node] if w.on[graphs.feature[node]] else graphs.off[node]
         if graphs.spread[node] > 0.0:
             return True
     return False
 
 
 @compiled
-def _show_unit(unit: int, following: Ints, w: Work, layout: Layout) -> None:
+def _show_variable(variable: int, following: Ints, w: Work, layout: Layout) -> None:
     """Shows what a unit became."""
-    n = n_columns(layout)
-    for member in range(layout.first[unit], layout.first[unit + 1]):
+    n = n_features(layout)
+    for member in range(layout.first[variable], layout.first[variable + 1]):
         factor = layout.members[member]
-        for column in range(w.shown[factor], w.shown[factor + 1]):
-            w.on[n + column] = layout.value[column] <= following[factor] <= layout.top[column]
+        for feature in range(w.shown[factor], w.shown[factor + 1]):
+            w.on[n + feature] = layout.value[feature] <= following[factor] <= layout.top[feature]
 
 
 @compiled
-def _draw(unit: int, u: float, w: Work, layout: Layout, graphs: Graphs, following: Ints, terminated: Bools, b: int) -> None:
+def _draw(variable: int, u: float, w: Work, layout: Layout, graphs: Graphs, following: Ints, terminated: Bools, b: int) -> None:
     """Draws a unit's value into a next state [F], or into ``terminated[b]``."""
-    chosen = _pick(w.rates, graphs.start[unit], layout.outputs[unit], u, w.values[unit])
-    if unit == len(layout.outputs) - 2:
+    chosen = _pick(w.rates, graphs.start[variable], layout.outputs[variable], u, w.values[variable])
+    if variable == len(layout.outputs) - 2:
         terminated[b] = chosen == 1
-    elif chosen != w.values[unit]:
-        write(following, unit, chosen, layout)
+    elif chosen != w.values[variable]:
+        write(following, variable, chosen, layout)
 
 
 @compiled
 def log_prob(
-    states: Ints, actions: Ints, following: Ints, terminated: Bools, layout: Layout, graphs: Graphs, late: Graphs
+    states: Ints, actions: Ints, following: Ints, terminated: Bools, layout: Layout, graphs: Graphs, synchronic: Graphs
 ) -> Floats:
     """Log-probability [B] of next states [B, F] and ends [B]."""
-    w, n_units, result = work_space(layout, graphs, late), len(layout.outputs), np.zeros(len(states), dtype=np.float64)
-    other, everything = np.empty(states.shape[1], dtype=np.int64), np.arange(n_units - 1)
+    w, n_variables, result = work_space(layout, graphs, synchronic), len(layout.outputs), np.zeros(len(states), dtype=np.float64)
+    other, everything = np.empty(states.shape[1], dtype=np.int64), np.arange(n_variables - 1)
     for b in range(len(states)):
         show(states[b], actions[b], layout, w.on)
         distributions(everything, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
-        if len(late.changing):
+        if len(synchronic.changing):
             show_next(following[b], layout, w.on)
-            show_next_meetings(following[b], layout, w.on)
-        for i in range(len(late.changing)):
-            if is_late(late.changing[i], actions[b], w, layout, graphs):
-                distributions(late.changing[i : i + 1], states[b], actions[b], layout, late, w.on, w.values, w.rates)
+            show_next_adjacencies(following[b], layout, w.on)
+        for i in range(len(synchronic.changing)):
+            if needs_synchronic(synchronic.changing[i], actions[b], w, layout, graphs):
+                distributions(synchronic.changing[i : i + 1], states[b], actions[b], layout, synchronic, w.on, w.values, w.rates)
         other[:] = states[b]
-        for unit in everything:
-            if layout.coupling_of[unit] >= 0:
+        for variable in everything:
+            if layout.mutex_of[variable] >= 0:
                 continue
-            then = int(terminated[b]) if unit == n_units - 2 else read(following[b], int(unit), layout)
-            p = w.rates[graphs.start[unit] + then]
+            then = int(terminated[b]) if variable == n_variables - 2 else read(following[b], int(variable), layout)
+            p = w.rates[graphs.start[variable] + then]
             result[b] += math.log(p) if p > 0.0 else -math.inf
-            if unit < n_units - 2 and then != w.values[unit]:
-                write(other, int(unit), then, layout)
+            if variable < n_variables - 2 and then != w.values[variable]:
+                write(other, int(variable), then, layout)
         for q in range(len(layout.exactly)):
-            couple(q, states[b], w.rates, w.still, layout, graphs, w.joint)
+            mutex_distribution(q, states[b], w.rates, w.still, layout, graphs, w.joint)
             then = which(following[b], q, layout)
             result[b] += math.log(w.joint[then]) if then >= 0 and w.joint[then] > 0.0 else -math.inf
             settle(other, q, then, layout)
@@ -223,18 +223,18 @@ def marginals(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, start
     for b in range(len(states)):
         show(states[b], actions[b], layout, w.on)
         distributions(everything, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
-        for unit in everything:
-            first, last = layout.first[unit], layout.first[unit + 1]
-            for k in range(layout.outputs[unit]):
-                p = w.rates[graphs.start[unit] + k]
+        for variable in everything:
+            first, last = layout.first[variable], layout.first[variable + 1]
+            for k in range(layout.outputs[variable]):
+                p = w.rates[graphs.start[variable] + k]
                 if last - first == 1:
                     out[b, start[layout.members[first]] + k] = p
                 else:
                     _write_bit(out[b], start[layout.members[first + k]], p)
         for q in range(len(layout.exactly)):
-            n = couple(q, states[b], w.rates, w.still, layout, graphs, w.joint)
+            n = mutex_distribution(q, states[b], w.rates, w.still, layout, graphs, w.joint)
             for k in range(n):
-                factor = layout.members[layout.first[layout.coupled[layout.coupled_first[q] + k]]]
+                factor = layout.members[layout.first[layout.mutex_members[layout.mutex_first[q] + k]]]
                 _write_bit(out[b], start[factor], w.joint[k])
 
 
@@ -269,12 +269,12 @@ def only_possible(probs: Floats, start: int, n: int) -> int:
 
 
 @compiled
-def uncertain(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, units: Ints) -> Bools:
+def uncertain(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, variables: Ints) -> Bools:
     """In which rows some units need their late graphs, bool [B, len(units)]."""
-    w, result = work_space(layout, graphs, graphs), np.zeros((len(states), len(units)), dtype=np.bool_)
+    w, result = work_space(layout, graphs, graphs), np.zeros((len(states), len(variables)), dtype=np.bool_)
     for b in range(len(states)):
         show(states[b], actions[b], layout, w.on)
-        distributions(units, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
-        for i in range(len(units)):
-            result[b, i] = is_late(units[i], actions[b], w, layout, graphs)
+        distributions(variables, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
+        for i in range(len(variables)):
+            result[b, i] = needs_synchronic(variables[i], actions[b], w, layout, graphs)
     return result

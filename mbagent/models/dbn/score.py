@@ -26,35 +26,35 @@ STRENGTH = 0.2
 """Both parameters of the Beta prior."""
 
 
-class Columns(NamedTuple):
+class FeatureBlocks(NamedTuple):
     """Columns that are on in each row, in compressed rows.
 
     Attributes:
         first: int64 [N + 1].
-        column: int64 [nonzeros].
-        n_columns: D.
+        feature: int64 [nonzeros].
+        n_features: D.
     """
 
     first: Ints
-    column: Ints
-    n_columns: int
+    feature: Ints
+    n_features: int
 
 
-class Head(NamedTuple):
+class Target(NamedTuple):
     """Rows in which one value of one unit is possible, and how often it came; rows that look alike are one row here.
 
     Attributes:
         rows: numbers of rows, int64 [R].
-        seen: how often each was met, int64 [R].
-        came: how often the value came then, int64 [R].
+        counts: how often each was met, int64 [R].
+        positives: how often the value came then, int64 [R].
         context: int64 [R], 0 ... C - 1.
         action: of each context, int64 [C]; -1 where contexts of several actions were merged.
         value: of the unit in each context, int64 [C]; -1 likewise.
     """
 
     rows: Ints
-    seen: Ints
-    came: Ints
+    counts: Ints
+    positives: Ints
     context: Ints
     action: Ints
     value: Ints
@@ -67,20 +67,20 @@ class Chosen(NamedTuple):
         gain: evidence beyond its price; 0 where no split has any.
         kind: ALL, ACTION, VALUE or SINGLE.
         which: the action, the value or the context.
-        column: what the rows are told apart by.
+        feature: what the rows are told apart by.
     """
 
     gain: float
     kind: int
     which: int
-    column: int
+    feature: int
 
 
-def columns_of(table: NDArray[np.generic]) -> Columns:
+def feature_blocks(table: NDArray[np.generic]) -> FeatureBlocks:
     """Columns of a table [N, D] of zeros and ones."""
-    rows, column = np.nonzero(table)
+    rows, feature = np.nonzero(table)
     first = np.searchsorted(rows, np.arange(len(table) + 1)).astype(np.int64)
-    return Columns(first, column.astype(np.int64), table.shape[1])
+    return FeatureBlocks(first, feature.astype(np.int64), table.shape[1])
 
 
 def evidence_tables(n: int, certain: float = 0.0, strength: float = STRENGTH) -> Tables:
@@ -101,17 +101,17 @@ def evidence_tables(n: int, certain: float = 0.0, strength: float = STRENGTH) ->
 
 
 @compiled
-def evidence(came: int, n: int, one: Floats, two: Floats, alike: Floats) -> float:
-    """Log marginal likelihood of ``came`` among ``n`` outcomes."""
-    if came == 0 or came == n:
+def evidence(positives: int, n: int, one: Floats, two: Floats, alike: Floats) -> float:
+    """Log marginal likelihood of ``positives`` among ``n`` outcomes."""
+    if positives == 0 or positives == n:
         return float(alike[n])
-    return float(one[came] + one[n - came] - two[n])
+    return float(one[positives] + one[n - positives] - two[n])
 
 
-def evidences(came: Ints, n: Ints, tables: Tables) -> Floats:
+def evidences(positives: Ints, n: Ints, tables: Tables) -> Floats:
     """As ``evidence``, of many."""
     one, two, alike = tables
-    result: Floats = np.where((came == 0) | (came == n), alike[n], one[came] + one[n - came] - two[n])
+    result: Floats = np.where((positives == 0) | (positives == n), alike[n], one[positives] + one[n - positives] - two[n])
     return result
 
 
@@ -120,29 +120,29 @@ class Tally(NamedTuple):
 
     Attributes:
         n, e: rows and arrivals of each context, int64 [C].
-        on, came_on: those with each column on, int64 [C, D].
+        on, positives_on: those with each column on, int64 [C, D].
     """
 
     n: Ints
     e: Ints
     on: Ints
-    came_on: Ints
+    positives_on: Ints
 
 
 @compiled
-def count(head: Head, columns: Columns) -> Tally:
+def count(target: Target, features: FeatureBlocks) -> Tally:
     """Counts rows and arrivals of each context, with each column on."""
-    n_contexts = len(head.action)
+    n_contexts = len(target.action)
     n, e = np.zeros((2, n_contexts), dtype=np.int64)
-    on, came_on = np.zeros((2, n_contexts, columns.n_columns), dtype=np.int64)
-    for r in range(len(head.rows)):
-        context, seen, came = head.context[r], head.seen[r], head.came[r]
-        n[context] += seen
-        e[context] += came
-        for j in range(columns.first[head.rows[r]], columns.first[head.rows[r] + 1]):
-            on[context, columns.column[j]] += seen
-            came_on[context, columns.column[j]] += came
-    return Tally(n, e, on, came_on)
+    on, positives_on = np.zeros((2, n_contexts, features.n_features), dtype=np.int64)
+    for r in range(len(target.rows)):
+        context, counts, positives = target.context[r], target.counts[r], target.positives[r]
+        n[context] += counts
+        e[context] += positives
+        for j in range(features.first[target.rows[r]], features.first[target.rows[r] + 1]):
+            on[context, features.feature[j]] += counts
+            positives_on[context, features.feature[j]] += positives
+    return Tally(n, e, on, positives_on)
 
 
 class Sets(NamedTuple):
@@ -165,39 +165,39 @@ class Sets(NamedTuple):
 
 
 @compiled
-def _sets(head: Head, n: Ints, e: Ints, one: Floats, two: Floats, alike: Floats) -> Sets:
-    n_actions, n_values = head.action.max() + 1, head.value.max() + 1
+def _sets(target: Target, n: Ints, e: Ints, one: Floats, two: Floats, alike: Floats) -> Sets:
+    n_actions, n_values = target.action.max() + 1, target.value.max() + 1
     n_sets = 2 + n_actions + n_values
     of = np.zeros((len(n), 3), dtype=np.int64)
-    of[:, 1] = np.where(head.action < 0, n_sets - 1, 1 + head.action)
-    of[:, 2] = np.where(head.value < 0, n_sets - 1, 1 + n_actions + head.value)
-    rows, came = np.zeros((2, n_sets), dtype=np.int64)
+    of[:, 1] = np.where(target.action < 0, n_sets - 1, 1 + target.action)
+    of[:, 2] = np.where(target.value < 0, n_sets - 1, 1 + n_actions + target.value)
+    rows, positives = np.zeros((2, n_sets), dtype=np.int64)
     total, base = np.zeros(n_sets), np.empty(len(n))
     for c in range(len(n)):
         base[c] = evidence(e[c], n[c], one, two, alike)
         for s in of[c]:
             rows[s] += n[c]
-            came[s] += e[c]
+            positives[s] += e[c]
             total[s] += base[c]
-    return Sets(of, rows, came, total, base, n_actions)
+    return Sets(of, rows, positives, total, base, n_actions)
 
 
 @compiled
-def best_split(head: Head, tally: Tally, prior: Floats, narrow: Floats, tables: Tables) -> Chosen:
+def best_split(target: Target, tally: Tally, prior: Floats, narrow: Floats, tables: Tables) -> Chosen:
     """The split with the most evidence beyond its price.
 
     On either side of the split, the contexts of the set share one rate or keep a rate each, whichever has more evidence.
 
     Args:
-        head: the rows, with at least two outcomes that differ.
+        target: the rows, with at least two outcomes that differ.
         tally: their counts.
         prior: log prior odds of each column as a cause in all contexts, [D]; -inf for one that must not be.
         narrow: log prior odds to be added for contexts of one action, of one value, and for a single context, [3].
         tables: evidence_tables of at least R.
     """
     one, two, alike = tables
-    n, e, on, came_on = tally
-    sets = _sets(head, n, e, one, two, alike)
+    n, e, on, positives_on = tally
+    sets = _sets(target, n, e, one, two, alike)
     n_sets = len(sets.n)
     set_n, set_e = np.zeros((2, n_sets), dtype=np.int64)
     inside, outside = np.zeros((2, n_sets))
@@ -209,11 +209,11 @@ def best_split(head: Head, tally: Tally, prior: Floats, narrow: Floats, tables: 
         for c in range(len(n)):
             if on[c, b] == 0:
                 continue
-            those = evidence(came_on[c, b], on[c, b], one, two, alike)
-            others = evidence(e[c] - came_on[c, b], n[c] - on[c, b], one, two, alike) - sets.base[c]
+            those = evidence(positives_on[c, b], on[c, b], one, two, alike)
+            others = evidence(e[c] - positives_on[c, b], n[c] - on[c, b], one, two, alike) - sets.base[c]
             for s in sets.of[c]:
                 set_n[s] += on[c, b]
-                set_e[s] += came_on[c, b]
+                set_e[s] += positives_on[c, b]
                 inside[s] += those
                 outside[s] += others
             gain = those + others + prior[b] + narrow[2]

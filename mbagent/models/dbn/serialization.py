@@ -11,15 +11,17 @@ from numpy.typing import NDArray
 from mbagent.models.dbn.arrays import Graphs
 from mbagent.models.dbn.features import Layout
 
-SAVED = tuple(name for name in Graphs._fields if name != "noise")
-"""Fields that are kept in files: how graphs are read for planning is no part of what was learned."""
+_FILE_NAMES = {"feature": "column", "persistence": "stays", "unseen_mass": "novelty"}
+
+SAVED = {_FILE_NAMES.get(field, field): field for field in Graphs._fields if field != "noise"}
+"""Names in files and the fields that they are of. ``noise`` belongs to planning and is not learned."""
 
 _FLOATS = ("rate", "spread", "stays", "novelty", "base", "still")
 
 
 def to_arrays(graphs: Graphs) -> dict[str, NDArray[Any]]:
     """The graphs' arrays by name."""
-    return {name: array.copy() for name, array in graphs._asdict().items() if name in SAVED}
+    return {name: getattr(graphs, field).copy() for name, field in SAVED.items()}
 
 
 def table_of(array: NDArray[Any], width: int) -> NDArray[np.int64]:
@@ -33,13 +35,13 @@ def table_of(array: NDArray[Any], width: int) -> NDArray[np.int64]:
     return np.ascontiguousarray(array, dtype=np.int64)
 
 
-def from_arrays(arrays: Mapping[str, NDArray[Any]], layout: Layout, n_columns: int) -> Graphs:
+def from_arrays(arrays: Mapping[str, NDArray[Any]], layout: Layout, n_features: int) -> Graphs:
     """The graphs that ``to_arrays`` took apart.
 
     Args:
         arrays: by name.
         layout: the units.
-        n_columns: number of columns that nodes can ask for.
+        n_features: number of columns that nodes can ask for.
 
     Raises:
         ValueError: they are no graphs of these units.
@@ -48,19 +50,21 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]], layout: Layout, n_columns: i
     if missing:
         raise ValueError(f"These weights are no decision graphs (first difference: {missing[0]!r}).")
     kinds = {name: np.float64 if name in _FLOATS else np.int64 for name in SAVED}
-    flat: dict[str, Any] = {name: np.ascontiguousarray(array, dtype=kinds[name]).reshape(-1) for name, array in arrays.items()}
+    flat: dict[str, Any] = {
+        SAVED[name]: np.ascontiguousarray(array, dtype=kinds[name]).reshape(-1) for name, array in arrays.items()
+    }
     graphs = Graphs(**flat, noise=np.zeros(1))
-    if not _sound(graphs, layout, n_columns):
+    if not _sound(graphs, layout, n_features):
         raise ValueError(
             "These weights do not fit: they are no graphs of these units; load them into a model of the same environment."
         )
     return graphs
 
 
-def _sound(graphs: Graphs, layout: Layout, n_columns: int) -> bool:
+def _sound(graphs: Graphs, layout: Layout, n_features: int) -> bool:
     """Whether every index leads somewhere and no path is endless."""
-    n_units, n_nodes, n_entries = len(layout.outputs), len(graphs.column), len(graphs.values)
-    pairs = np.concatenate([[0], np.cumsum(layout.acts.n_ways * layout.outputs)])
+    n_variables, n_nodes, n_entries = len(layout.outputs), len(graphs.feature), len(graphs.values)
+    pairs = np.concatenate([[0], np.cumsum(layout.encoding.n_action_classes * layout.outputs)])
     start = np.concatenate([[0], np.cumsum(layout.outputs)])
     if not (np.array_equal(graphs.pairs, pairs) and np.array_equal(graphs.start, start)):
         return False
@@ -78,10 +82,10 @@ def _sound(graphs: Graphs, layout: Layout, n_columns: int) -> bool:
     }
     if any(len(getattr(graphs, name)) != length for name, length in lengths.items()):
         return False
-    asks, numbers = graphs.column >= 0, np.arange(n_nodes)
+    asks, numbers = graphs.feature >= 0, np.arange(n_nodes)
     return bool(
-        _within(graphs.changing, n_units)
-        and _within(graphs.column + 1, n_columns + 1)
+        _within(graphs.changing, n_variables)
+        and _within(graphs.feature + 1, n_features + 1)
         and _within(graphs.nodes, n_nodes)
         and (np.diff(graphs.entries) >= 0).all()
         and (graphs.entries[0], graphs.entries[-1]) == (0, n_entries)
@@ -97,8 +101,8 @@ def _sound(graphs: Graphs, layout: Layout, n_columns: int) -> bool:
 def _values_fit(graphs: Graphs, layout: Layout) -> bool:
     """Whether each entry's value is one that its unit has."""
     pair = np.repeat(np.arange(len(graphs.entries) - 1), np.diff(graphs.entries))
-    unit = np.searchsorted(graphs.pairs, pair, side="right") - 1
-    return bool(((graphs.values >= 0) & (graphs.values < layout.outputs[unit])).all())
+    variable = np.searchsorted(graphs.pairs, pair, side="right") - 1
+    return bool(((graphs.values >= 0) & (graphs.values < layout.outputs[variable])).all())
 
 
 def _within(values: NDArray[np.int64], n: int) -> bool:

@@ -14,7 +14,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from mbagent.models.dbn.leaf_prior import best_prior
-from mbagent.models.dbn.score import Chosen, Columns, Head, Tables, best_split, columns_of, evidence, evidence_tables, evidences
+from mbagent.models.dbn.score import (
+    Chosen,
+    FeatureBlocks,
+    Tables,
+    Target,
+    best_split,
+    evidence,
+    evidence_tables,
+    evidences,
+    feature_blocks,
+)
 from mbagent.models.dbn.splits import Pair, Search
 from mbagent.types import Bools, Floats, Ints
 from mbagent_envs.jit import compiled
@@ -47,7 +57,7 @@ MOST_CONTEXTS = 4
 """Contexts of a head that pairs are looked for in, the most mixed ones."""
 
 
-MOST_COLUMNS = 500
+MOST_FEATURES = 500
 """Columns that pairs are made of; of more, those that tell most by themselves."""
 
 EXACT = 2**24
@@ -69,22 +79,22 @@ class PairSearch:
     def __init__(self, kinds: Ints, table: Bools, tables: Tables) -> None:
         """See the class."""
         self.kinds, self.table, self.tables = kinds, table, tables
-        self._seen: dict[int, int] = {}
+        self._n_searched: dict[int, int] = {}
         self._found: list[Pair] = []
 
     def divide(self, searches: Sequence[Search]) -> bool:
         """One round over all heads that changed since the last; whether any pair was found."""
         prior, found = self._prior(), False
         for h, search in enumerate(searches):
-            if not search.open or self._seen.get(h) == len(search.splits):
+            if not search.open or self._n_searched.get(h) == len(search.splits):
                 continue
             worth = self._worth(search, float(prior.max()))
-            pairs = find_pairs(search.head, worth, self.table, prior, self._pattern_prior(), self.tables)
+            pairs = find_pairs(search.target, worth, self.table, prior, self._pattern_prior(), self.tables)
             for pair in pairs:
                 search.divide_by_pair(pair, self.table)
             self._found += pairs
             found = found or bool(pairs)
-            self._seen[h] = len(search.splits) if not pairs else -1
+            self._n_searched[h] = len(search.splits) if not pairs else -1
         return found
 
     def _worth(self, search: Search, most: float) -> list[int]:
@@ -121,11 +131,13 @@ class PairSearch:
         return result
 
 
-def find_pairs(head: Head, contexts: Sequence[int], table: Bools, prior: Floats, patterns: Floats, tables: Tables) -> list[Pair]:
+def find_pairs(
+    target: Target, contexts: Sequence[int], table: Bools, prior: Floats, patterns: Floats, tables: Tables
+) -> list[Pair]:
     """The best pair, and after it further ones in the same context that have no column in common with those before.
 
     Args:
-        head: the rows.
+        target: the rows.
         contexts: contexts to look in.
         table: columns of all rows, bool [N, D].
         prior: log prior odds of each pair of columns, [D, D].
@@ -134,33 +146,35 @@ def find_pairs(head: Head, contexts: Sequence[int], table: Bools, prior: Floats,
     """
     found: list[Pair] = []
     for context in contexts:
-        rows = head.context == context
-        if head.seen[rows].sum() >= FEWEST and rows.sum() * min(table.shape[1], MOST_COLUMNS) ** 2 < MOST_WORK:
-            here, seen, came = table[head.rows[rows]], head.seen[rows], head.came[rows]
-            kept = _telling_most(here, seen, came, tables)
-            pairs = _in_context(context, here[:, kept], seen, came, prior[np.ix_(kept, kept)], patterns, tables)
+        rows = target.context == context
+        if target.counts[rows].sum() >= FEWEST and rows.sum() * min(table.shape[1], MOST_FEATURES) ** 2 < MOST_WORK:
+            here, counts, positives = table[target.rows[rows]], target.counts[rows], target.positives[rows]
+            kept = _telling_most(here, counts, positives, tables)
+            pairs = _in_context(context, here[:, kept], counts, positives, prior[np.ix_(kept, kept)], patterns, tables)
             found += [pair._replace(first=int(kept[pair.first]), second=int(kept[pair.second])) for pair in pairs]
     best = max(found, default=None)
     return [] if best is None else [pair for pair in found if pair.context == best.context]
 
 
-def _telling_most(table: Bools, seen: Ints, came: Ints, tables: Tables) -> Ints:
+def _telling_most(table: Bools, counts: Ints, positives: Ints, tables: Tables) -> Ints:
     """Numbers of the columns that pairs are made of, ascending: all of them, or those that tell most by themselves."""
-    n_columns = table.shape[1]
-    if n_columns <= MOST_COLUMNS:
-        return np.arange(n_columns)
+    n_features = table.shape[1]
+    if n_features <= MOST_FEATURES:
+        return np.arange(n_features)
     on = table.T.astype(np.float64)
-    n, e = (np.rint(on @ weights).astype(np.int64) for weights in (seen, came))
-    gain = evidences(e, n, tables) + evidences(came.sum() - e, seen.sum() - n, tables)
-    return np.sort(np.argsort(-gain, kind="stable")[:MOST_COLUMNS])
+    n, e = (np.rint(on @ weights).astype(np.int64) for weights in (counts, positives))
+    gain = evidences(e, n, tables) + evidences(positives.sum() - e, counts.sum() - n, tables)
+    return np.sort(np.argsort(-gain, kind="stable")[:MOST_FEATURES])
 
 
 def _in_context(
-    context: int, table: Bools, seen: Ints, came: Ints, prior: Floats, patterns: Floats, tables: Tables
+    context: int, table: Bools, counts: Ints, positives: Ints, prior: Floats, patterns: Floats, tables: Tables
 ) -> list[Pair]:
-    arrived = came > 0
-    both_n, both_e = _both(table, seen), _both(table[arrived], came[arrived])
-    best, which = _best_patterns(both_n, both_e, int(seen.sum()), int(came.sum()), np.asarray(PATTERNS), patterns, prior, tables)
+    arrived = positives > 0
+    both_n, both_e = _both(table, counts), _both(table[arrived], positives[arrived])
+    best, which = _best_patterns(
+        both_n, both_e, int(counts.sum()), int(positives.sum()), np.asarray(PATTERNS), patterns, prior, tables
+    )
     pairs: list[Pair] = []
     while best.size and (top := float(best.max())) > 0.0:
         first, second = (int(i) for i in np.unravel_index(int(best.argmax()), best.shape))
@@ -186,13 +200,13 @@ def _both(on: Bools, weights: Ints) -> Ints:
 
 
 @compiled
-def _count_both(first: Ints, column: Ints, weights: Ints, n_columns: int) -> Ints:
+def _count_both(first: Ints, feature: Ints, weights: Ints, n_features: int) -> Ints:
     """As ``_both``, of columns in compressed rows, ascending in each."""
-    both = np.zeros((n_columns, n_columns), dtype=np.int64)
+    both = np.zeros((n_features, n_features), dtype=np.int64)
     for r in range(len(weights)):
         for i in range(first[r], first[r + 1]):
             for j in range(i, first[r + 1]):
-                both[column[i], column[j]] += weights[r]
+                both[feature[i], feature[j]] += weights[r]
     return both
 
 
@@ -236,22 +250,22 @@ MOST_SPLITS = 256
 """Most splits of one head."""
 
 
-def find_splits(heads: Sequence[Head], table: Bools, kinds: Ints, n_actions: int, in_pairs: bool = True) -> list[Search]:
+def find_splits(targets: Sequence[Target], table: Bools, kinds: Ints, n_actions: int, in_pairs: bool = True) -> list[Search]:
     """The splits of each head, and its rows with the contexts that they lead to.
 
     A first search tells how much of this world is certain at all; the second one knows.
 
     Args:
-        heads: what is to be explained.
+        targets: what is to be explained.
         table: columns of all rows that look different, bool [N, D].
         kinds: which kind of thing each column is, int64 [D]; causes of one kind make others of that kind likelier.
         n_actions: number of actions A.
         in_pairs: whether to look for causes that matter only together, too.
     """
-    columns = columns_of(table)
-    most = max((int(head.seen.sum()) for head in heads), default=0) + 1
-    first = _searched(heads, table, columns, kinds, n_actions, evidence_tables(most), False)
-    return _searched(heads, table, columns, kinds, n_actions, evidence_tables(most, certainty(first)), in_pairs)
+    features = feature_blocks(table)
+    most = max((int(target.counts.sum()) for target in targets), default=0) + 1
+    first = _searched(targets, table, features, kinds, n_actions, evidence_tables(most), False)
+    return _searched(targets, table, features, kinds, n_actions, evidence_tables(most, certainty(first)), in_pairs)
 
 
 def certainty(searches: Sequence[Search]) -> float:
@@ -260,23 +274,23 @@ def certainty(searches: Sequence[Search]) -> float:
 
 
 def _searched(
-    heads: Sequence[Head], table: Bools, columns: Columns, kinds: Ints, n_actions: int, tables: Tables, in_pairs: bool
+    targets: Sequence[Target], table: Bools, features: FeatureBlocks, kinds: Ints, n_actions: int, tables: Tables, in_pairs: bool
 ) -> list[Search]:
-    searches = [Search(head) for head in heads]
+    searches = [Search(target) for target in targets]
     for search in searches:
         search.merge(tables)
-    go_on(searches, table, columns, kinds, n_actions, tables, in_pairs)
+    go_on(searches, table, features, kinds, n_actions, tables, in_pairs)
     return searches
 
 
 def go_on(
-    searches: Sequence[Search], table: Bools, columns: Columns, kinds: Ints, n_actions: int, tables: Tables, in_pairs: bool
+    searches: Sequence[Search], table: Bools, features: FeatureBlocks, kinds: Ints, n_actions: int, tables: Tables, in_pairs: bool
 ) -> None:
     """Divides further as long as evidence grows; see ``find_splits``."""
     pairs = PairSearch(kinds, table, tables)
     going = True
     while going:
-        while found := _next_splits(searches, columns, kinds, n_actions, tables):
+        while found := _next_splits(searches, features, kinds, n_actions, tables):
             for h, chosen in found:
                 searches[h].divide(chosen, table, tables)
                 searches[h].open = len(searches[h].splits) < MOST_SPLITS
@@ -284,30 +298,30 @@ def go_on(
 
 
 def _next_splits(
-    searches: Sequence[Search], columns: Columns, kinds: Ints, n_actions: int, tables: Tables
+    searches: Sequence[Search], features: FeatureBlocks, kinds: Ints, n_actions: int, tables: Tables
 ) -> list[tuple[int, Chosen]]:
     """One more split for each head that has one: of all heads, or of the surer half once there is a prior to teach."""
-    prior, learned = column_prior(searches, kinds, columns.n_columns)
-    counts = np.asarray([sum(split.column >= 0 for split in search.splits) for search in searches])
+    prior, learned = feature_prior(searches, kinds, features.n_features)
+    counts = np.asarray([sum(split.feature >= 0 for split in search.splits) for search in searches])
     narrow = -np.asarray([math.log(n_actions) + 1.0, 2.0, 3.0])
     found = []
     for h, search in enumerate(searches):
         if search.open:
             more = ((counts > counts[h]).sum() + 0.5) / ((counts >= counts[h]).sum() + 1.0)
             odds = math.log(more / (1.0 - more)) if learned else -FIRST
-            chosen = best_split(search.head, search.tally(columns), np.minimum(prior + odds, -LEAST), narrow, tables)
+            chosen = best_split(search.target, search.tally(features), np.minimum(prior + odds, -LEAST), narrow, tables)
             if chosen.gain > 0.0:
                 found.append((h, chosen))
     found.sort(key=lambda entry: -entry[1].gain)
     return found[: max(1, len(found) // 2)] if learned and found else found
 
 
-def column_prior(searches: Sequence[Search], kinds: Ints, n_columns: int) -> tuple[Floats, bool]:
+def feature_prior(searches: Sequence[Search], kinds: Ints, n_features: int) -> tuple[Floats, bool]:
     """Log probability of each column to be the next cause [D], and whether it was learned from those found so far."""
-    chosen = [split.column for search in searches for split in search.splits if split.column >= 0]
+    chosen = [split.feature for search in searches for split in search.splits if split.feature >= 0]
     if len(chosen) < max(3, len(searches) // 10):
-        return np.full(n_columns, -math.log(n_columns)), False
-    used = np.bincount(chosen, minlength=n_columns).astype(np.float64)
+        return np.full(n_features, -math.log(n_features)), False
+    used = np.bincount(chosen, minlength=n_features).astype(np.float64)
     n_kinds = int(kinds.max()) + 1
     again = (0.5 + np.maximum(used - 1, 0).sum()) / (len(chosen) + 1.0)
     of_kind = np.bincount(kinds, weights=used, minlength=n_kinds) + 0.2

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.dbn import expander as expander  # registers its overloads
-from mbagent.models.dbn.affected_variables import Lean, ends_late_only, lean
-from mbagent.models.dbn.arrays import Graphs, distributions, n_columns, show, show_next, show_next_meetings, write
+from mbagent.models.dbn.affected_variables import AffectedIndex, affected_index, only_end_is_synchronic
+from mbagent.models.dbn.arrays import Graphs, distributions, n_features, show, show_next, show_next_adjacencies, write
 from mbagent.models.dbn.features import Layout
-from mbagent.models.dbn.fitting import Fitted, nothing_late
+from mbagent.models.dbn.fitting import Fitted, no_synchronic
 from mbagent.models.dbn.invariants import leave_out
-from mbagent.models.dbn.mutex import couple, leave_out_none, n_choices, settle
-from mbagent.models.dbn.sampling import Work, alone, is_late, only_possible, work_space
+from mbagent.models.dbn.mutex import leave_out_none, mutex_distribution, n_choices, settle
+from mbagent.models.dbn.sampling import Work, alone, needs_synchronic, only_possible, work_space
 from mbagent.models.overloads import Outcomes, implements, outcomes, work_for
 from mbagent.models.protocol import Successors
 from mbagent.models.systematic_sampling import (
@@ -46,12 +46,12 @@ from mbagent_envs.jit import compiled
 
 
 @compiled
-def successors(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, late: Graphs, grid: Grid) -> Found:
+def successors(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, synchronic: Graphs, grid: Grid) -> Found:
     """The outcomes of each row, unit after unit; see ``particles.py``. The graphs must be those for planning."""
-    w, n_units, n_grid = work_space(layout, graphs, late), len(layout.outputs), grid[0]
+    w, n_variables, n_grid = work_space(layout, graphs, synchronic), len(layout.outputs), grid[0]
     single = alone(layout, graphs, w.later)
-    early = np.concatenate((single[single < n_units - 1], n_units + np.arange(len(layout.exactly))))
-    width = n_units + len(layout.exactly)
+    early = np.concatenate((single[single < n_variables - 1], n_variables + np.arange(len(layout.exactly))))
+    width = n_variables + len(layout.exactly)
     p, found = new_particles(n_grid, width, len(w.joint)), room(len(states), n_grid, states.shape[1] + 1)
     still_open, base = np.empty(width, dtype=np.int64), np.empty(states.shape[1], dtype=np.int64)
     total = 0
@@ -60,7 +60,7 @@ def successors(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, late
         distributions(graphs.changing, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
         base[:] = states[b]
         n_open, ended = 0, False
-        begin(p, n_grid, _fits(early, states[b], actions[b], layout, graphs, late, w, n_grid), place_of(states[b]))
+        begin(p, n_grid, _fits(early, states[b], actions[b], layout, graphs, synchronic, w, n_grid), place_of(states[b]))
         for number in early:
             n, value = _distribution(number, states[b], layout, graphs, w)
             best = only_possible(w.joint, 0, n)
@@ -69,17 +69,21 @@ def successors(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, late
                     ended = _put(base, number, best, layout, ended)
                 continue
             still_open[n_open] = number
-            share_out(p, -1, number, n_open, w.joint, n, number == n_units - 2, grid)
+            share_out(p, -1, number, n_open, w.joint, n, number == n_variables - 2, grid)
             n_open += 1
-        if len(late.changing):
-            n_open = _split_late(p, n_open, states[b], actions[b], base, still_open, ended, layout, graphs, late, w, grid)
+        if len(synchronic.changing):
+            n_open = _split_synchronic(
+                p, n_open, states[b], actions[b], base, still_open, ended, layout, graphs, synchronic, w, grid
+            )
         _list(p, n_open, base, still_open, ended, layout, found, b, total, n_grid)
         total += found[0][b]
     return used(found, total)
 
 
 @compiled
-def _fits(early: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs, late: Graphs, w: Work, n_grid: int) -> bool:
+def _fits(
+    early: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs, synchronic: Graphs, w: Work, n_grid: int
+) -> bool:
     """Whether all outcomes of a row can be listed."""
     possible = 1
     for number in early:
@@ -89,9 +93,11 @@ def _fits(early: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs,
             possible *= n_possible(w.rates, graphs.start[number], layout.outputs[number])
         if possible > n_grid:
             return False
-    for unit in late.changing:
-        late_here = is_late(unit, action, w, layout, graphs)
-        possible *= layout.outputs[unit] if late_here else n_possible(w.rates, graphs.start[unit], layout.outputs[unit])
+    for variable in synchronic.changing:
+        late_here = needs_synchronic(variable, action, w, layout, graphs)
+        possible *= (
+            layout.outputs[variable] if late_here else n_possible(w.rates, graphs.start[variable], layout.outputs[variable])
+        )
         possible = min(possible, 2 * n_grid + 1)
     return bool(possible <= 2 * n_grid)
 
@@ -99,9 +105,9 @@ def _fits(early: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs,
 @compiled
 def _distribution(number: int, state: Ints, layout: Layout, graphs: Graphs, w: Work) -> tuple[int, int]:
     """Writes the distribution of a unit, or of a coupling, to ``w.joint``; returns its size and the present value or -1."""
-    n_units = len(layout.outputs)
-    if number >= n_units:
-        n = couple(number - n_units, state, w.rates, w.still, layout, graphs, w.joint) + 1
+    n_variables = len(layout.outputs)
+    if number >= n_variables:
+        n = mutex_distribution(number - n_variables, state, w.rates, w.still, layout, graphs, w.joint) + 1
         leave_out_none(w.joint, n)
         return n, -1
     n, start = layout.outputs[number], graphs.start[number]
@@ -110,7 +116,7 @@ def _distribution(number: int, state: Ints, layout: Layout, graphs: Graphs, w: W
 
 
 @compiled
-def _split_late(
+def _split_synchronic(
     p: Particles,
     n_open: int,
     state: Ints,
@@ -120,17 +126,17 @@ def _split_late(
     ended: bool,
     layout: Layout,
     graphs: Graphs,
-    late: Graphs,
+    synchronic: Graphs,
     w: Work,
     grid: Grid,
 ) -> int:
     """Draws the late units, each given what the particle became so far; returns how many open units there are."""
     following, end = np.empty_like(base), len(layout.outputs) - 2
-    for i in range(len(late.changing)):
-        number = late.changing[i]
-        n, start = layout.outputs[number], late.start[number]
+    for i in range(len(synchronic.changing)):
+        number = synchronic.changing[i]
+        n, start = layout.outputs[number], synchronic.start[number]
         still_open[n_open] = number
-        if not is_late(number, action, w, layout, graphs):
+        if not needs_synchronic(number, action, w, layout, graphs):
             w.joint[:n] = w.rates[start : start + n]
             share_out(p, -1, number, n_open, w.joint, n, number == end, grid)
             n_open += 1
@@ -141,8 +147,8 @@ def _split_late(
             _fill(following, base, p, slot, still_open, n_open, layout, ended)
             show_next(following, layout, w.on)
             if number == end:
-                show_next_meetings(following, layout, w.on)
-            distributions(late.changing[i : i + 1], state, action, layout, late, w.on, w.values, w.rates)
+                show_next_adjacencies(following, layout, w.on)
+            distributions(synchronic.changing[i : i + 1], state, action, layout, synchronic, w.on, w.values, w.rates)
             w.joint[:n] = w.rates[start : start + n]
             share_out(p, slot, number, n_open, w.joint, n, number == end, grid)
         n_open += 1
@@ -186,18 +192,18 @@ def _fill(state: Ints, base: Ints, p: Particles, slot: int, still_open: Ints, n_
 @compiled
 def _put(state: Ints, number: int, value: int, layout: Layout, ended: bool) -> bool:
     """Gives a unit or coupling its value in a next state; returns whether the episode is over."""
-    n_units = len(layout.outputs)
-    if number == n_units - 2:
+    n_variables = len(layout.outputs)
+    if number == n_variables - 2:
         return value == 1
-    if number >= n_units:
-        settle(state, number - n_units, value, layout)
+    if number >= n_variables:
+        settle(state, number - n_variables, value, layout)
     else:
         write(state, number, value, layout)
     return ended
 
 
 @compiled
-def event_draws(rate: float, n_grid: int) -> int:
+def reset_draws(rate: float, n_grid: int) -> int:
     """Of ``n_grid`` draws, those that go to the rare event: its share, or a quarter; one at least for each of what can happen."""
     if rate <= 0.0 or rate >= 1.0:
         return 0 if rate <= 0.0 else n_grid
@@ -220,25 +226,25 @@ class WholeKernel(NamedTuple):
     """Decision graphs for compiled search, where some units are drawn late, or rare events happen.
 
     Attributes:
-        layout, usual, late, event: see ``fitting.Fitted``; for planning.
-        event_late: graphs of nothing.
-        has_event: whether there are rare events.
+        layout, usual, synchronic, reset: see ``fitting.Fitted``; for planning.
+        reset_synchronic: graphs of nothing.
+        has_reset: whether there are rare events.
     """
 
     layout: Layout
     usual: Graphs
-    late: Graphs
-    event: Graphs
-    event_late: Graphs
-    has_event: bool
+    synchronic: Graphs
+    reset: Graphs
+    reset_synchronic: Graphs
+    has_reset: bool
 
 
-def kernel_of(fitted: Fitted, cardinalities: tuple[int, ...]) -> Lean | WholeKernel:
+def kernel_of(fitted: Fitted, cardinalities: tuple[int, ...]) -> AffectedIndex | WholeKernel:
     """The kernel of fitted graphs for planning: the lean one where it says everything."""
-    if not fitted.has_event and ends_late_only(fitted.layout, fitted.late):
-        return lean(fitted.layout, fitted.usual, fitted.late, cardinalities)
-    none = nothing_late(fitted.event)
-    return WholeKernel(fitted.layout, fitted.usual, fitted.late, fitted.event, none, bool(fitted.has_event))
+    if not fitted.has_reset and only_end_is_synchronic(fitted.layout, fitted.synchronic):
+        return affected_index(fitted.layout, fitted.usual, fitted.synchronic, cardinalities)
+    none = no_synchronic(fitted.reset)
+    return WholeKernel(fitted.layout, fitted.usual, fitted.synchronic, fitted.reset, none, bool(fitted.has_reset))
 
 
 class WholeWork(NamedTuple):
@@ -250,7 +256,7 @@ class WholeWork(NamedTuple):
         rates: their distributions, [sum of cardinalities].
         actions: int64 [A].
         states: int64 [1, F].
-        event: number of the event's unit, int64 [1].
+        reset: number of the event's unit, int64 [1].
     """
 
     on: Bools
@@ -258,7 +264,7 @@ class WholeWork(NamedTuple):
     rates: Floats
     actions: Ints
     states: Ints
-    event: Ints
+    reset: Ints
 
 
 @implements(work_for, WholeKernel)
@@ -267,10 +273,10 @@ def whole_work(kernel: WholeKernel, n_grid: int) -> WholeWork:
     """See compiled_model."""
     layout = kernel.layout
     return WholeWork(
-        np.empty(n_columns(layout), dtype=np.bool_),
+        np.empty(n_features(layout), dtype=np.bool_),
         np.empty(len(layout.outputs), dtype=np.int64),
         np.empty(kernel.usual.start[-1], dtype=np.float64),
-        np.arange(len(layout.acts.way)),
+        np.arange(len(layout.encoding.action_class)),
         np.empty((1, layout.n_factors), dtype=np.int64),
         np.array([len(layout.outputs) - 1]),
     )
@@ -284,21 +290,21 @@ def whole_outcomes(
     """See compiled_model; every unit is asked."""
     layout, graphs, states, actions, total = kernel.layout, kernel.usual, work.states, work.actions, 0
     states[:] = state
-    for action in range(len(layout.acts.way)):
+    for action in range(len(layout.encoding.action_class)):
         rate, a = 0.0, action
-        if kernel.has_event:
+        if kernel.has_reset:
             show(state, action, layout, work.on)
-            distributions(work.event, state, action, layout, graphs, work.on, work.values, work.rates)
+            distributions(work.reset, state, action, layout, graphs, work.on, work.values, work.rates)
             rate = work.rates[graphs.start[-1] - 1]
-        draws, n, out.left_out[action] = event_draws(rate, n_grid), 0, 0.0
+        draws, n, out.left_out[action] = reset_draws(rate, n_grid), 0, 0.0
         if rate < 1.0:
             grid = (max(1, n_grid - draws), key, offset)
-            found = successors(states[:1], actions[a : a + 1], layout, graphs, kernel.late, grid)
+            found = successors(states[:1], actions[a : a + 1], layout, graphs, kernel.synchronic, grid)
             n = _take(found[1], found[2], found[3], 1.0 - rate, total, out)
             out.left_out[action] += (1.0 - rate) * found[4][0]
         if rate > 0.0:
             grid = (draws, key, offset)
-            found = successors(states[:1], actions[a : a + 1], layout, kernel.event, kernel.event_late, grid)
+            found = successors(states[:1], actions[a : a + 1], layout, kernel.reset, kernel.reset_synchronic, grid)
             n += _take(found[1], found[2], found[3], rate, total + n, out)
             out.left_out[action] += rate * found[4][0]
         if len(layout.counts) or len(layout.met):

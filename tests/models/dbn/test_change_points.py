@@ -6,7 +6,7 @@ from gymnasium import spaces
 
 from mbagent.data import TransitionDataset
 from mbagent.models.dbn import DecisionGraphModel, LocalGraphModel
-from mbagent.models.dbn.change_points import still_true_since
+from mbagent.models.dbn.change_points import last_changes
 from mbagent.spaces import FactoredSpace
 from tests.models.helpers import dataset
 
@@ -58,7 +58,7 @@ def test_planes_follow_a_change_too() -> None:
 
 def test_the_longest_past_that_still_holds_is_kept() -> None:
     rows = dataset((2,) * 4, 2, *switches(6000, 4000)).rows()
-    since = still_true_since(rows, 5, DecisionGraphModel((2,) * 4, 2)._factors_foretold)
+    since = last_changes(rows, 5, DecisionGraphModel((2,) * 4, 2)._factor_log_probs)
     assert 4000 <= since[0] <= 4020
     assert (since[1:] == 0).all()
 

@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from mbagent.models.dbn import DecisionGraphModel
-from mbagent.models.dbn.effects import SUMS, Manner, ask_in
-from mbagent.models.dbn.features import Seen
+from mbagent.models.dbn.effects import SUMS, Effect, questions_for_effect
+from mbagent.models.dbn.features import Observed
 from mbagent.types import Ints
 from tests.models.helpers import dataset
 
@@ -15,39 +15,39 @@ LAST, ORDERS, DEMAND = 12, 6, 3.0
 EVERY = np.stack(np.meshgrid(np.arange(LAST + 1), np.arange(ORDERS), indexing="ij"), axis=-1).reshape(-1, 2)
 
 
-def following(manner: Manner, value: Ints, action: Ints, luck: Ints) -> Ints:
+def following(effect: Effect, value: Ints, action: Ints, uniform: Ints) -> Ints:
     """What comes of a stock that orders fill and demand empties, or of a queue that is served and that luck makes longer."""
-    stocks = manner in (Manner.ADDS, Manner.FILLS)
+    stocks = effect in (Effect.SUM, Effect.CLIPPED_SUM)
     level = value + action if stocks else value - action
-    if manner in (Manner.FILLS, Manner.DRAINS):  # what there is no room for is gone before luck comes
+    if effect in (Effect.CLIPPED_SUM, Effect.CLIPPED_DIFFERENCE):  # what there is no room for is gone before luck comes
         level = level.clip(0, LAST)
-    after: Ints = np.clip(level - luck if stocks else level + luck, 0, LAST)
+    after: Ints = np.clip(level - uniform if stocks else level + uniform, 0, LAST)
     return after
 
 
-def world(n: int, manner: Manner) -> tuple[Ints, Ints, Ints]:
+def world(n: int, effect: Effect) -> tuple[Ints, Ints, Ints]:
     """Transitions of one."""
     rng = np.random.default_rng(0)
     value, action = rng.integers(LAST + 1, size=n), rng.integers(ORDERS, size=n)
-    return value[:, None], action, following(manner, value, action, rng.poisson(DEMAND, n))[:, None]
+    return value[:, None], action, following(effect, value, action, rng.poisson(DEMAND, n))[:, None]
 
 
-def truth(manner: Manner) -> NDArray[np.float64]:
+def truth(effect: Effect) -> NDArray[np.float64]:
     """Distribution of what follows every pair (value, action), [pairs, values]."""
     probs = np.zeros((len(EVERY), LAST + 1))
-    for luck in range(60):
-        after = following(manner, EVERY[:, 0], EVERY[:, 1], np.full(len(EVERY), luck))
-        probs[np.arange(len(EVERY)), after] += stats.poisson.pmf(luck, DEMAND)
+    for uniform in range(60):
+        after = following(effect, EVERY[:, 0], EVERY[:, 1], np.full(len(EVERY), uniform))
+        probs[np.arange(len(EVERY)), after] += stats.poisson.pmf(uniform, DEMAND)
     return probs
 
 
 @pytest.mark.parametrize("manner", SUMS)
 @pytest.mark.parametrize(("n", "mean", "most"), [(500, 0.1, 0.5), (1500, 0.06, 0.15)])
-def test_stocks_and_queues_are_known_from_few_transitions(manner: Manner, n: int, mean: float, most: float) -> None:
+def test_stocks_and_queues_are_known_from_few_transitions(effect: Effect, n: int, mean: float, most: float) -> None:
     model = DecisionGraphModel((LAST + 1,), ORDERS)
-    model.fit(dataset((LAST + 1,), ORDERS, *world(n, manner)))
+    model.fit(dataset((LAST + 1,), ORDERS, *world(n, effect)))
     found = model.marginals(EVERY[:, :1], EVERY[:, 1])[:, : LAST + 1]
-    distance = 0.5 * np.abs(found - truth(manner)).sum(axis=1)
+    distance = 0.5 * np.abs(found - truth(effect)).sum(axis=1)
     assert distance.mean() < mean  # 1,500 transitions are 19 of each pair, whose frequencies are .2 away
     assert distance.max() < most
 
@@ -69,9 +69,9 @@ def test_numbers_of_actions_that_mean_nothing_are_not_added() -> None:
 
 
 def test_questions_of_sums_cover_every_value_but_the_present_one_once() -> None:
-    now, actions, then = (part.ravel() for part in world(4000, Manner.ADDS))
+    now, actions, then = (part.ravel() for part in world(4000, Effect.SUM))
     pair = actions * (LAST + 1) + now
-    asked = ask_in(Manner.ADDS, 0, LAST + 1, ORDERS, Seen(pair, actions, now, then))
+    asked = questions_for_effect(Effect.SUM, 0, LAST + 1, ORDERS, Observed(pair, actions, now, then))
     entries = np.concatenate([np.stack([question.pairs, question.values], axis=1) for question in asked])
     assert len(np.unique(entries, axis=0)) == len(entries)
     assert (entries[:, 0] % (LAST + 1) != entries[:, 1]).all()
@@ -79,16 +79,16 @@ def test_questions_of_sums_cover_every_value_but_the_present_one_once() -> None:
     met = np.unique(np.stack([pair, then], axis=1)[now != then], axis=0)
     assert {tuple(row) for row in met.tolist()} <= {tuple(row) for row in entries.tolist()}
     bound = [question for question in asked if len(np.unique(question.values)) == 1 and question.values[0] == 0][-1]
-    assert bound.head.context.max() + 1 == LAST + ORDERS  # one for each sum
-    assert (bound.head.came.sum(), bound.head.seen.sum()) == ((then == 0).sum(), len(then))
+    assert bound.target.context.max() + 1 == LAST + ORDERS  # one for each sum
+    assert (bound.target.positives.sum(), bound.target.counts.sum()) == ((then == 0).sum(), len(then))
 
 
 def test_orders_that_were_never_made_are_known_from_those_that_were() -> None:
-    states, actions, after = world(5000, Manner.ADDS)
+    states, actions, after = world(5000, Effect.SUM)
     some = actions < ORDERS - 1
     model = DecisionGraphModel((LAST + 1,), ORDERS)
     model.fit(dataset((LAST + 1,), ORDERS, states[some], actions[some], after[some]))
     new = EVERY[EVERY[:, 1] == ORDERS - 1][: LAST - ORDERS]
     found = model.marginals(new[:, :1], new[:, 1])[:, : LAST + 1]
-    distance = 0.5 * np.abs(found - truth(Manner.ADDS)[EVERY[:, 1] == ORDERS - 1][: len(new)]).sum(axis=1)
+    distance = 0.5 * np.abs(found - truth(Effect.SUM)[EVERY[:, 1] == ORDERS - 1][: len(new)]).sum(axis=1)
     assert distance.max() < 0.15

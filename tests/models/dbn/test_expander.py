@@ -7,7 +7,7 @@ import pytest
 from gymnasium import spaces
 
 from mbagent.models.dbn import DecisionGraphModel
-from mbagent.models.dbn.affected_variables import Lean
+from mbagent.models.dbn.affected_variables import AffectedIndex
 from mbagent.models.dbn.successors import WholeKernel
 from mbagent.models.mdp import StateGraph
 from mbagent.models.registry import build_model
@@ -68,9 +68,9 @@ def of_walker() -> tuple[DecisionGraphModel, np.ndarray]:
 def test_an_end_that_hangs_on_what_comes_is_still_lean() -> None:
     model, _ = of_walker()
     kernel = model.kernel()
-    assert isinstance(kernel, Lean)
+    assert isinstance(kernel, AffectedIndex)
     assert len(kernel.end_first) == 2
-    assert len(model.fitted.late.changing) == 1
+    assert len(model.fitted.synchronic.changing) == 1
 
 
 WORLDS: dict[str, Callable[[], tuple[DecisionGraphModel, np.ndarray]]] = {
@@ -96,7 +96,7 @@ def test_compiled_expansion_is_that_of_the_successors(name: str) -> None:
     model, states = WORLDS[name]()
     roots = np.unique(states[::7], axis=0)[:60]
     compiled, plain = StateGraph(model), StateGraph(model)
-    assert isinstance(compiled.kernel, Lean | WholeKernel)
+    assert isinstance(compiled.kernel, AffectedIndex | WholeKernel)
     plain.kernel = None
     groups = np.zeros(len(roots), dtype=np.int64)
     for draws in (1, 4, 16):

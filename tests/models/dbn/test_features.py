@@ -6,7 +6,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mbagent.models.dbn import DecisionGraphModel, LocalGraphModel
-from mbagent.models.dbn.features import acts_of, shown_acts
+from mbagent.models.dbn.features import action_encoding, action_feature_table
 from mbagent.models.mdp import StateGraph
 from mbagent.models.registry import build_model
 from mbagent.spaces import ActionEnumeration, FactoredSpace
@@ -25,9 +25,9 @@ def test_columns_are_the_parts_of_the_actions_that_a_space_enumerates() -> None:
     enumerated = ActionEnumeration(spaces.MultiDiscrete([2, 3, 2]))
     parts = enumerated.decode(np.arange(enumerated.n))
     expected = np.stack([parts[:, 0] == 1, *(parts[:, 1] == v for v in range(3)), parts[:, 2] == 1], axis=1)
-    acts = acts_of(enumerated.factored.cardinalities)
-    assert np.array_equal(shown_acts(acts, np.arange(enumerated.n)), expected)
-    assert np.array_equal(shown_acts(acts_of((4,)), np.arange(4)), np.eye(4, dtype=bool))
+    encoding = action_encoding(enumerated.factored.cardinalities)
+    assert np.array_equal(action_feature_table(encoding, np.arange(enumerated.n)), expected)
+    assert np.array_equal(action_feature_table(action_encoding((4,)), np.arange(4)), np.eye(4, dtype=bool))
 
 
 def test_one_switch_of_eight_is_learned_from_few_steps_and_for_actions_never_taken() -> None:

@@ -5,7 +5,7 @@ import pytest
 from gymnasium import spaces
 
 from mbagent.models.dbn import LocalGraphModel
-from mbagent.models.dbn.invariants import LAWLESS, Laws, all_kept, find_laws, lawful, radix
+from mbagent.models.dbn.invariants import NO_INVARIANTS, Invariants, all_kept, enforced, find_invariants, radix
 from mbagent.models.protocol import Successors
 from mbagent.spaces import FactoredSpace
 from tests.models.helpers import dataset
@@ -55,10 +55,10 @@ def test_counts_and_combinations_are_found() -> None:
     before, actions, after, ends = crowd(2000, 1)
     assert SPACE.planes is not None
     rows = dataset(SPACE.cardinalities, 2, before, actions, after, ends).rows()
-    laws = find_laws(rows, SPACE.planes, (KINDS, COLOURS))
-    assert {(int(c), int(v)) for c, v in laws.counts} == {(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 3)}
-    assert set(np.flatnonzero(laws.met)) == {0, 1 + KINDS, 2 + 3 * KINDS}
-    few = find_laws(rows.select(slice(50)), SPACE.planes, (KINDS, COLOURS))
+    invariants = find_invariants(rows, SPACE.planes, (KINDS, COLOURS))
+    assert {(int(c), int(v)) for c, v in invariants.counts} == {(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 3)}
+    assert set(np.flatnonzero(invariants.met)) == {0, 1 + KINDS, 2 + 3 * KINDS}
+    few = find_invariants(rows.select(slice(50)), SPACE.planes, (KINDS, COLOURS))
     assert len(few.counts) == 0
 
 
@@ -68,22 +68,22 @@ def test_new_combinations_that_keep_coming_are_no_law() -> None:
     space = FactoredSpace(spaces.MultiDiscrete(np.full((2, SIZE, SIZE), 20)))
     assert space.planes is not None
     rows = dataset(space.cardinalities, 1, before, np.zeros(n, dtype=np.int64), np.roll(before, 1, axis=0)).rows()
-    assert find_laws(rows, space.planes, (20, 20)).none
+    assert find_invariants(rows, space.planes, (20, 20)).none
 
 
 def test_what_breaks_a_law_is_left_out_and_the_others_share_its_probability() -> None:
     cells, weights = np.arange(2).reshape(1, 1, 2), radix((3,))
-    laws = LAWLESS._replace(counts=np.array([[0, 1]]))
+    invariants = NO_INVARIANTS._replace(counts=np.array([[0, 1]]))
     states = np.array([[1, 0], [0, 0]])
     following = np.array([[1, 0], [0, 1], [1, 1], [0, 0], [0, 0], [1, 0]])
     over = np.array([False, False, False, True, False, False])
     found = Successors(np.array([0, 4, 6]), following, over, np.array([0.1, 0.3, 0.4, 0.2, 0.5, 0.5]))
-    kept = lawful(laws, weights, cells, states, found)
+    kept = enforced(invariants, weights, cells, states, found)
     np.testing.assert_array_equal(kept.offsets, [0, 3, 4])
     np.testing.assert_array_equal(kept.states, [[1, 0], [0, 1], [0, 0], [0, 0]])
     np.testing.assert_allclose(kept.probabilities, [0.2, 0.6, 0.2, 1.0])
-    impossible = laws._replace(met=np.array([False, False, True]))
-    assert len(lawful(impossible, weights, cells, states, found).states) == 6  # no outcome keeps it: all stay
+    impossible = invariants._replace(met=np.array([False, False, True]))
+    assert len(enforced(impossible, weights, cells, states, found).states) == 6  # no outcome keeps it: all stay
 
 
 def test_draws_keep_the_laws_and_are_told_their_probability() -> None:
@@ -97,8 +97,8 @@ def test_draws_keep_the_laws_and_are_told_their_probability() -> None:
     rows, on = found.rows, ~found.terminated
     assert all_kept(layout.counts, layout.met, layout.weights, layout.cells, some[rows], found.states)[on].all()
     np.testing.assert_allclose(np.bincount(rows, weights=found.probabilities), 1.0)
-    told = np.exp(model.log_prob(some[rows], actions[rows], found.states, found.terminated))
-    totals = np.bincount(rows, weights=told)
+    determined = np.exp(model.log_prob(some[rows], actions[rows], found.states, found.terminated))
+    totals = np.bincount(rows, weights=determined)
     assert totals.max() < 1.05
     assert totals.min() > 0.6  # 256 draws do not meet all that may happen
     broken = some[:1].copy()
@@ -137,5 +137,5 @@ def test_laws_are_saved_and_damaged_ones_refused() -> None:
 
 
 def test_no_laws_cost_nothing() -> None:
-    assert LAWLESS.none
-    assert not Laws(np.array([[0, 1]]), LAWLESS.met).none
+    assert NO_INVARIANTS.none
+    assert not Invariants(np.array([[0, 1]]), NO_INVARIANTS.met).none

@@ -12,7 +12,7 @@ from mbagent import data as data_module
 from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.models.dbn import DecisionGraphModel, LocalGraphModel, large_data
 from mbagent.models.dbn import model as graph_model
-from mbagent.models.dbn.plane_features import NEXT, NEXT_MEETING, Reach, column_values, relative_columns, values_at
+from mbagent.models.dbn.plane_features import NEXT, NEXT_ADJACENCY, Reach, feature_values, relative_features, values_at
 from mbagent.spaces import FactoredSpace
 from mbagent.wrappers import History
 from mbagent_envs import Maneuverer
@@ -22,11 +22,11 @@ from tests.models.helpers import played
 def test_columns_of_some_cells_are_those_of_all() -> None:
     rng = np.random.default_rng(0)
     planes, actions = rng.integers(2, size=(6, 2, 3, 5)).astype(np.uint8), rng.integers(3, size=6)
-    columns = relative_columns((2, 2), (3,), Reach(1, wrap=True))
-    columns = columns[~np.isin(columns[:, 0], (NEXT, NEXT_MEETING))]
+    features = relative_features((2, 2), (3,), Reach(1, wrap=True))
+    features = features[~np.isin(features[:, 0], (NEXT, NEXT_ADJACENCY))]
     cells = rng.permutation(6 * 15)[:40]
-    found = values_at(columns, planes, actions, cells // 15, cells % 15 // 5, cells % 5)
-    assert np.array_equal(found, column_values(columns, planes, actions)[cells])
+    found = values_at(features, planes, actions, cells // 15, cells % 15 // 5, cells % 5)
+    assert np.array_equal(found, feature_values(features, planes, actions)[cells])
 
 
 @pytest.fixture
@@ -50,10 +50,10 @@ def test_as_much_is_learned_with_little_room(request: pytest.FixtureRequest) -> 
     game = Maneuverer(size=4)
     data, tests = played(game, 2000, 100), played(game, 1000, 100, seed=1).rows()
     model, (states, _) = likeliest(data, tests)
-    assert model.fitted.found[0].head.seen.sum() == 2000 * 16
+    assert model.fitted.found[0].target.counts.sum() == 2000 * 16
     request.getfixturevalue("little_room")
     smaller, (others, _) = likeliest(data, tests)
-    assert smaller.fitted.found[0].head.seen.sum() == 2000 * 16  # all were counted, though few were searched
+    assert smaller.fitted.found[0].target.counts.sum() == 2000 * 16  # all were counted, though few were searched
     assert (states == others).all(axis=1).mean() > 0.99
     again, _ = likeliest(data, tests)
     assert all(np.array_equal(again.state_dict()[name], part) for name, part in smaller.state_dict().items())
@@ -98,8 +98,8 @@ def test_a_past_is_copied_and_tells_when_things_move() -> None:
     model = LocalGraphModel(space, 2, Reach(1, wrap=True))
     model.fit(data, seed=0)
     found, _ = model.likeliest(states, actions)
-    late = np.arange(len(rows)) % 40 >= 3  # before, the past shows the first observation again and again
-    assert (found == after).all(axis=1)[late].all()
+    synchronic = np.arange(len(rows)) % 40 >= 3  # before, the past shows the first observation again and again
+    assert (found == after).all(axis=1)[synchronic].all()
 
 
 @pytest.mark.parametrize("flat", [False, True])

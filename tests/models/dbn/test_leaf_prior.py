@@ -3,7 +3,7 @@ import pytest
 from scipy.special import comb
 
 from mbagent.models.dbn.leaf_prior import CENTRES, MIXED_STRENGTH, LeafPrior, MixedPrior, best_prior, fitted_prior
-from mbagent.models.dbn.score import Head
+from mbagent.models.dbn.score import Target
 from mbagent.models.dbn.splits import Search
 from mbagent.types import Floats, Ints
 
@@ -14,7 +14,7 @@ UNEQUAL = MixedPrior(0.5, MIXED_STRENGTH, np.arange(1.0, len(CENTRES) + 1) / np.
 def leaves(n: Ints, e: Ints) -> list[Search]:
     """One head whose leaves have these counts."""
     each = np.arange(len(n))
-    return [Search(Head(each, n, e, each, each, np.zeros_like(each)))]
+    return [Search(Target(each, n, e, each, each, np.zeros_like(each)))]
 
 
 def drawn(rates: Floats, n: int, seed: int) -> tuple[Ints, Ints]:
@@ -33,16 +33,16 @@ def test_outcomes_have_probabilities_that_sum_to_one(prior: LeafPrior, n: int) -
 
 def test_the_next_outcome_comes_at_the_rate_of_the_leaf() -> None:
     """A posterior mean is a ratio of evidences."""
-    n, e, typical = np.array([0, 5, 40]), np.array([0, 2, 39]), np.array([0.5, 0.2, 0.9])
+    n, e, prior_mean = np.array([0, 5, 40]), np.array([0, 2, 39]), np.array([0.5, 0.2, 0.9])
     for prior in (LeafPrior(0.3, 1.0), UNEQUAL):
-        ratio = np.exp(prior.evidence(n + 1, e + 1, typical)[0] - prior.evidence(n, e, typical)[0])
-        np.testing.assert_allclose(prior.rates(n, e, typical), ratio, rtol=1e-6)
+        ratio = np.exp(prior.evidence(n + 1, e + 1, prior_mean)[0] - prior.evidence(n, e, prior_mean)[0])
+        np.testing.assert_allclose(prior.rates(n, e, prior_mean), ratio, rtol=1e-6)
 
 
 def test_equal_weights_are_the_simple_prior() -> None:
-    n, e, typical = np.array([3, 10, 200]), np.array([1, 9, 11]), np.array([0.4, 0.8, 0.1])
+    n, e, prior_mean = np.array([3, 10, 200]), np.array([1, 9, 11]), np.array([0.4, 0.8, 0.1])
     simple = LeafPrior(EQUAL.certain, EQUAL.strength)
-    np.testing.assert_allclose(EQUAL.rates(n, e, typical), simple.rates(n, e, typical), atol=2e-3)
+    np.testing.assert_allclose(EQUAL.rates(n, e, prior_mean), simple.rates(n, e, prior_mean), atol=2e-3)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -51,8 +51,8 @@ def test_few_kinds_of_luck_are_told_from_the_luck_of_few_rows(seed: int) -> None
     rates = np.where(np.random.default_rng(seed).random(500) < 0.5, 0.02, 0.97)
     n, e = drawn(rates, 35, seed)
     found = leaves(n, e)
-    typical = found[0].typical
-    errors = [np.square(prior.rates(n, e, typical) - rates).mean() for prior in (best_prior(found), fitted_prior(found))]
+    prior_mean = found[0].prior_mean
+    errors = [np.square(prior.rates(n, e, prior_mean) - rates).mean() for prior in (best_prior(found), fitted_prior(found))]
     assert errors[1] < 0.25 * errors[0]
 
 
@@ -61,7 +61,7 @@ def test_rates_of_all_kinds_stay_what_they_are() -> None:
     for rows in (5, 50, 5000):
         n, e = drawn(rates, rows, 0)
         found = leaves(n, e)
-        simple, fitted = (prior.rates(n, e, found[0].typical) for prior in (best_prior(found), fitted_prior(found)))
+        simple, fitted = (prior.rates(n, e, found[0].prior_mean) for prior in (best_prior(found), fitted_prior(found)))
         assert np.square(fitted - rates).mean() < 1.05 * np.square(simple - rates).mean()
 
 

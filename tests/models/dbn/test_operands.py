@@ -7,8 +7,8 @@ from scipy import stats
 
 from mbagent.data import TransitionBatch
 from mbagent.models.dbn import DecisionGraphModel
-from mbagent.models.dbn.effects import Partner, candidates, chained, likely_partners
-from mbagent.models.dbn.features import acts_of, column_table, lay_out
+from mbagent.models.dbn.effects import Operand, candidates, chained, likely_operands
+from mbagent.models.dbn.features import action_encoding, feature_table, make_layout
 from mbagent.types import Ints
 from tests.models.helpers import dataset
 
@@ -90,8 +90,8 @@ def test_a_sum_is_not_passed_over_where_much_is_known() -> None:
     model.fit(dataset((10, 5), 2, states, actions, np.column_stack([left, rng.integers(5, size=n)])))
     every = np.array(list(np.ndindex(10, 5)))
     expected = np.zeros((50, 10))
-    for luck in range(5):
-        expected[np.arange(50), np.clip(every.sum(axis=1) - luck, 0, 9)] += 0.2
+    for uniform in range(5):
+        expected[np.arange(50), np.clip(every.sum(axis=1) - uniform, 0, 9)] += 0.2
     found = model.marginals(every, np.zeros(50, dtype=np.int64))[:, :10]
     assert 0.5 * np.abs(found - expected).sum(axis=1).max() < 0.08  # by moves 0.2
 
@@ -102,47 +102,47 @@ def test_sums_that_would_take_too_much_are_left_alone() -> None:
     following = states.copy()
     following[:, 0] = np.clip(states.sum(axis=1) - rng.integers(50, size=n), 0, 99)
     found = rows(states, np.zeros(n, dtype=np.int64), following)
-    assert likely_partners((0,), candidates((100, 100), (1,)), found) == [None]
+    assert likely_operands((0,), candidates((100, 100), (1,)), found) == [None]
     small = rows(states // 10, np.zeros(n, dtype=np.int64), following // 10)
-    assert likely_partners((0,), candidates((10, 10), (1,)), small) == [(Partner(10, 1), 1)]
+    assert likely_operands((0,), candidates((10, 10), (1,)), small) == [(Operand(10, 1), 1)]
 
 
 def test_the_likeliest_partner_is_the_one_that_is_added() -> None:
     parts = (ORDERS, 2, ORDERS)
     every = candidates((LAST + 1, 2, 4), parts)
-    assert every == [Partner(LAST + 1, 0), Partner(4, 2), Partner(ORDERS, -1, 12, 0), Partner(ORDERS, -1, 1, 7)]
-    assert candidates((2,), (5,)) == [Partner(5, whole=True)]
+    assert every == [Operand(LAST + 1, 0), Operand(4, 2), Operand(ORDERS, -1, 12, 0), Operand(ORDERS, -1, 1, 7)]
+    assert candidates((2,), (5,)) == [Operand(5, whole=True)]
     assert candidates((2,), (2,)) == candidates((2, 2), (2, 2)) == []
     rng, n = np.random.default_rng(0), 400
     states, actions = rng.integers([LAST + 1, 2, 4], size=(n, 3)), rng.integers(72, size=n)
     following = states.copy()
     following[:, 0] = np.clip(states[:, 0] - actions // 12 + rng.integers(3, size=n), 0, LAST)
     following[:, 2] = rng.integers(4, size=n)
-    assert likely_partners((0, 2), every, rows(states, actions, following)) == [(every[2], -1), None]
-    assert likely_partners((0, 2), every, rows(states, actions, following).select(slice(10))) == [None, None]
+    assert likely_operands((0, 2), every, rows(states, actions, following)) == [(every[2], -1), None]
+    assert likely_operands((0, 2), every, rows(states, actions, following).select(slice(10))) == [None, None]
 
 
 @pytest.mark.parametrize("partner", candidates((LAST + 1, 2, 4), (ORDERS, 2, ORDERS)))
-def test_columns_tell_a_partners_value(partner: Partner) -> None:
-    rng, layout = np.random.default_rng(0), lay_out((LAST + 1, 2, 4), (), acts_of((ORDERS, 2, ORDERS)))
+def test_columns_tell_a_partners_value(operand: Operand) -> None:
+    rng, layout = np.random.default_rng(0), make_layout((LAST + 1, 2, 4), (), action_encoding((ORDERS, 2, ORDERS)))
     states, actions = rng.integers([LAST + 1, 2, 4], size=(200, 3)), rng.integers(72, size=200)
-    shown = column_table(layout, states, actions)[:, partner.columns(layout)]
+    shown = feature_table(layout, states, actions)[:, operand.features(layout)]
     assert (shown.sum(axis=1) == 1).all()
-    np.testing.assert_array_equal(shown.argmax(axis=1), partner.of(rows(states, actions, states)))
+    np.testing.assert_array_equal(shown.argmax(axis=1), operand.of(rows(states, actions, states)))
 
 
 def test_chains_lead_on_by_the_partners_value() -> None:
     links = [(-1, 0, 0)] * 4  # three leaves and one for what has no entry
     entries = np.array([(0, 5, 7, 1), (2, 5, 7, 2), (1, 5, 8, 3)])
 
-    def add(column: int, off: int, on: int) -> int:
-        links.append((column, off, on))
+    def add(feature: int, off: int, on: int) -> int:
+        links.append((feature, off, on))
         return len(links) - 1
 
     def lead(node: int, value: int) -> int:
         while links[node][0] >= 0:
-            column, off, on = links[node]
-            node = on if column == 10 + value else off
+            feature, off, on = links[node]
+            node = on if feature == 10 + value else off
         return node
 
     nodes = {(now, value): node for now, value, node in chained(entries, np.array([10, 11, 12]), add, 0).tolist()}

@@ -12,18 +12,18 @@ from mbagent import ModelLearningAgent
 from mbagent.data import TransitionDataset
 from mbagent.models.dbn import DecisionGraphModel, LocalGraphModel
 from mbagent.models.dbn.features import BEYOND
-from mbagent.models.dbn.grounding import COLUMN, WHOLE, Coupling
+from mbagent.models.dbn.grounding import COLUMN, WHOLE, Mutex
 from mbagent.models.dbn.plane_features import (
     ACTION,
     BORDER,
     CELL,
     NEXT,
-    NEXT_MEETING,
+    NEXT_ADJACENCY,
     WRAP,
     Reach,
-    column_kinds,
-    column_values,
-    relative_columns,
+    feature_kinds,
+    feature_values,
+    relative_features,
 )
 from mbagent.spaces import FactoredSpace
 from mbagent_envs import FlierCatcher, Maneuverer
@@ -38,14 +38,14 @@ def planes(*shape: int) -> FactoredSpace:
 def test_columns_are_what_lies_around_each_position() -> None:
     rng = np.random.default_rng(0)
     board, actions = rng.integers(2, size=(4, 2, 3, 5)), rng.integers(3, size=4)
-    columns = relative_columns((2, 2), (3,), Reach(1, wrap=True))
+    features = relative_features((2, 2), (3,), Reach(1, wrap=True))
     after = rng.integers(2, size=board.shape)
-    table = column_values(columns, board, actions, after).reshape(4, 3, 5, len(columns))
+    table = feature_values(features, board, actions, after).reshape(4, 3, 5, len(features))
 
     def cell(n: int, channel: int, y: int, x: int, planes: np.ndarray = board) -> bool:
         return 0 <= y < 3 and 0 <= x < 5 and bool(planes[n, channel, y, x] == 1)
 
-    for d, (kind, *parts) in enumerate(columns.tolist()):
+    for d, (kind, *parts) in enumerate(features.tolist()):
         for n, y, x in np.ndindex(4, 3, 5):
             if kind == CELL:
                 expected = cell(n, parts[0], y + parts[2], x + parts[3])
@@ -60,7 +60,7 @@ def test_columns_are_what_lies_around_each_position() -> None:
                 expected = not (0 <= i < 3 and 0 <= j < 5) and cell(n, parts[0], i % 3, j % 5)
             else:
                 first, _, second, _, below, right = parts
-                shown = after if kind == NEXT_MEETING else board
+                shown = after if kind == NEXT_ADJACENCY else board
 
                 def outside(i: int, j: int) -> bool:
                     return not (0 <= i < 3 and 0 <= j < 5)
@@ -71,8 +71,8 @@ def test_columns_are_what_lies_around_each_position() -> None:
                     for i, j in np.ndindex(3, 5)
                 )
             assert table[n, y, x, d] == expected, (kind, parts)
-    assert len(np.unique(columns, axis=0)) == len(columns)
-    assert len(column_kinds(columns)) == len(columns)
+    assert len(np.unique(features, axis=0)) == len(features)
+    assert len(feature_kinds(features)) == len(features)
 
 
 def gliders(n: int, seed: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -105,7 +105,7 @@ def test_a_world_of_planes_is_learned_and_its_end(model: LocalGraphModel) -> Non
     drawn, over = model.sample(states, actions, derive(1, np.arange(2000)))
     np.testing.assert_array_equal(drawn[:, :9], following[:, :9])
     np.testing.assert_array_equal(over, ends)
-    assert Coupling(0, WHOLE, 0, True) in model.local.couplings
+    assert Mutex(0, WHOLE, 0, True) in model.local.mutexes
     on = states[:, 9:] == 1
     assert drawn[:, 9:][on].mean() == pytest.approx(0.75, abs=0.02)
     assert not drawn[:, 9:][~on].any()
@@ -145,7 +145,7 @@ def test_what_is_never_on_together_is_drawn_together() -> None:
     space = FactoredSpace(game.observation_space)
     model = LocalGraphModel(space, 3)
     model.fit(played(game, 3000, 100))
-    assert Coupling(1, COLUMN, -1, False) in model.local.couplings
+    assert Mutex(1, COLUMN, -1, False) in model.local.mutexes
     rows = played(game, 1000, 100, seed=1).rows()
     drawn, _ = model.sample(rows.states, rows.actions, derive(4, np.arange(1000)))
     spawned = drawn.reshape(-1, 2, 4, 5)[:, 1, :, -1].sum(axis=1)
@@ -237,7 +237,7 @@ def test_lines_that_a_smaller_board_does_not_have_are_left_out() -> None:
     following[:, 0, 3] = np.eye(5, dtype=np.int64)[rng.integers(5, size=n), :4]  # one at most, in row 3 only
     model = LocalGraphModel(space, 2)
     model.fit(dataset(space.cardinalities, 2, states.reshape(n, -1), rng.integers(2, size=n), following.reshape(n, -1)))
-    assert any(coupling.line in (3, -5) for coupling in model.local.couplings)
+    assert any(mutex.line in (3, -5) for mutex in model.local.mutexes)
     smaller = model.for_space(spaces.MultiBinary((1, 3, 4)))
     drawn, _ = smaller.sample(np.zeros((5, 12), dtype=np.int64), np.zeros(5, dtype=np.int64), derive(1, np.arange(5)))
     assert drawn.shape == (5, 12)

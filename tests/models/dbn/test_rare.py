@@ -92,7 +92,7 @@ def test_one_of_a_thousand_events_in_which_everything_changes_is_planned_with() 
     after[reset] = rng.integers(2, size=(reset.sum(), bits))
     model = DecisionGraphModel((2,) * bits, 2)
     report = model.fit(dataset((2,) * bits, 2, before, action, after, np.zeros(n, dtype=bool)))
-    assert model.fitted.has_event, report
+    assert model.fitted.has_reset, report
     for chances in (part[2] for part in listed(model, [0, 1] * 6, 4)):
         assert chances.sum() == pytest.approx(1.0)
         assert 0.002 < chances[chances < 0.5].sum() < 0.008

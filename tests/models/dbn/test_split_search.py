@@ -5,46 +5,46 @@ import pytest
 from scipy import special
 
 from mbagent.models.dbn.mutex import find_cliques, find_groups
-from mbagent.models.dbn.score import ALL, SINGLE, Head, best_split, columns_of, count, evidence, evidence_tables
+from mbagent.models.dbn.score import ALL, SINGLE, Target, best_split, count, evidence, evidence_tables, feature_blocks
 from mbagent.models.dbn.split_search import find_splits
 from mbagent.models.dbn.splits import Search
 
 RNG = np.random.default_rng(0)
 
 
-def head(came: np.ndarray, context: np.ndarray | None = None) -> Head:
+def target(positives: np.ndarray, context: np.ndarray | None = None) -> Target:
     """A head over all rows; contexts are actions with one value."""
-    context = np.zeros(len(came), dtype=np.int64) if context is None else context
+    context = np.zeros(len(positives), dtype=np.int64) if context is None else context
     n = int(context.max()) + 1
-    once = np.ones(len(came), dtype=np.int64)
-    return Head(np.arange(len(came)), once, came.astype(np.int64), context, np.arange(n), np.zeros(n, dtype=np.int64))
+    once = np.ones(len(positives), dtype=np.int64)
+    return Target(np.arange(len(positives)), once, positives.astype(np.int64), context, np.arange(n), np.zeros(n, dtype=np.int64))
 
 
 def rate_by_columns(search: Search, table: np.ndarray) -> np.ndarray:
     """Share of arrivals in the context of each row."""
     n, e = search.counts()
-    rates: np.ndarray = (e / np.maximum(n, 1))[search.head.context]
+    rates: np.ndarray = (e / np.maximum(n, 1))[search.target.context]
     assert len(rates) == len(table)
     return rates
 
 
 def test_evidence_is_the_marginal_likelihood_under_a_beta_prior() -> None:
     tables = evidence_tables(40)
-    for came, n in ((0, 0), (0, 7), (3, 7), (40, 40)):
-        exact = special.betaln(came + 0.2, n - came + 0.2) - special.betaln(0.2, 0.2)
-        assert evidence(came, n, *tables) == pytest.approx(exact)
+    for positives, n in ((0, 0), (0, 7), (3, 7), (40, 40)):
+        exact = special.betaln(positives + 0.2, n - positives + 0.2) - special.betaln(0.2, 0.2)
+        assert evidence(positives, n, *tables) == pytest.approx(exact)
 
 
 def test_the_best_split_has_the_evidence_that_counting_by_hand_gives() -> None:
     table = RNG.random((300, 6)) < 0.4
     context = RNG.integers(3, size=300)
-    came = (table[:, 4] & (context != 1)) | (RNG.random(300) < 0.1)
+    positives = (table[:, 4] & (context != 1)) | (RNG.random(300) < 0.1)
     tables = evidence_tables(301)
-    asked = head(came, context)
-    chosen = best_split(asked, count(asked, columns_of(table)), np.full(6, -2.0), np.array([-50.0, -50.0, -3.0]), tables)
+    asked = target(positives, context)
+    chosen = best_split(asked, count(asked, feature_blocks(table)), np.full(6, -2.0), np.array([-50.0, -50.0, -3.0]), tables)
 
     def total(rows: np.ndarray) -> float:
-        return float(evidence(int(came[rows].sum()), int(rows.sum()), *tables))
+        return float(evidence(int(positives[rows].sum()), int(rows.sum()), *tables))
 
     before = [total(context == c) for c in range(3)]
     gains = {}
@@ -56,14 +56,14 @@ def test_the_best_split_has_the_evidence_that_counting_by_hand_gives() -> None:
             gains[SINGLE, c, b] = sides[0][c] + sides[1][c] - before[c] - 5.0
     best = max(gains, key=lambda key: gains[key])
     assert chosen.gain == pytest.approx(gains[best])
-    assert (chosen.kind, chosen.which, chosen.column) == best
+    assert (chosen.kind, chosen.which, chosen.feature) == best
 
 
 def test_one_cause_is_found_from_little_data_and_nothing_else() -> None:
     table = RNG.random((120, 80)) < 0.3
-    found = find_splits([head(table[:, 17])], table, np.zeros(80, dtype=np.int64), 1)[0]
-    assert [split.column for split in found.splits if split.column >= 0] == [17]
-    noise = find_splits([head(RNG.random(400) < 0.5)], RNG.random((400, 80)) < 0.3, np.zeros(80, dtype=np.int64), 1)[0]
+    found = find_splits([target(table[:, 17])], table, np.zeros(80, dtype=np.int64), 1)[0]
+    assert [split.feature for split in found.splits if split.feature >= 0] == [17]
+    noise = find_splits([target(RNG.random(400) < 0.5)], RNG.random((400, 80)) < 0.3, np.zeros(80, dtype=np.int64), 1)[0]
     assert not noise.splits
 
 
@@ -71,21 +71,31 @@ def test_one_cause_is_found_from_little_data_and_nothing_else() -> None:
 def test_causes_that_matter_only_together_are_found(rule: str) -> None:
     table = RNG.random((600, 40)) < 0.5
     first, second = table[:, 5], table[:, 31]
-    came = {"xor": first ^ second, "and": first & second, "neither": ~first & ~second, "second only": ~first & second}[rule]
-    found = find_splits([head(came)], table, np.zeros(40, dtype=np.int64), 1)[0]
-    assert {split.column for split in found.splits if split.column >= 0} == {5, 31}
-    np.testing.assert_array_equal(rate_by_columns(found, table), came.astype(float))
+    positives = {"xor": first ^ second, "and": first & second, "neither": ~first & ~second, "second only": ~first & second}[rule]
+    found = find_splits([target(positives)], table, np.zeros(40, dtype=np.int64), 1)[0]
+    assert {split.feature for split in found.splits if split.feature >= 0} == {5, 31}
+    np.testing.assert_array_equal(rate_by_columns(found, table), positives.astype(float))
 
 
 def test_contexts_with_one_rate_share_a_leaf_and_others_do_not() -> None:
     context = np.repeat(np.arange(4), 200)
-    came = RNG.random(800) < np.array([0.5, 0.5, 0.5, 0.5])[context]
+    positives = RNG.random(800) < np.array([0.5, 0.5, 0.5, 0.5])[context]
     assert (
-        len(find_splits([head(came, context)], np.zeros((800, 1), dtype=np.bool_), np.zeros(1, np.int64), 4)[0].head.action) == 1
+        len(
+            find_splits([target(positives, context)], np.zeros((800, 1), dtype=np.bool_), np.zeros(1, np.int64), 4)[
+                0
+            ].target.action
+        )
+        == 1
     )
-    came = RNG.random(800) < np.array([0.05, 0.9, 0.05, 0.9])[context]
+    positives = RNG.random(800) < np.array([0.05, 0.9, 0.05, 0.9])[context]
     assert (
-        len(find_splits([head(came, context)], np.zeros((800, 1), dtype=np.bool_), np.zeros(1, np.int64), 4)[0].head.action) == 4
+        len(
+            find_splits([target(positives, context)], np.zeros((800, 1), dtype=np.bool_), np.zeros(1, np.int64), 4)[
+                0
+            ].target.action
+        )
+        == 4
     )
 
 

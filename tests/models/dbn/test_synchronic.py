@@ -30,7 +30,7 @@ def tied() -> DecisionGraphModel:
 
 def test_variables_that_depend_on_each_other_are_drawn_jointly(tied: DecisionGraphModel) -> None:
     possible, ends = outcomes(CARDINALITIES)
-    assert tied.fitted.late.changing.tolist() == [1, 3]  # the second coin, given the first; the end, given all
+    assert tied.fitted.synchronic.changing.tolist() == [1, 3]  # the second coin, given the first; the end, given all
     for action in (0, 1):
         probs = np.exp(tied.log_prob(np.zeros((24, 3), dtype=np.int64), np.full(24, action), possible, ends))
         alike = (possible[:, 0] ^ possible[:, 1]) == action
@@ -95,7 +95,7 @@ def test_several_things_on_one_plane_are_each_drawn_once() -> None:
     space, states, actions, following = wanderers(4000, 0)
     model = LocalGraphModel(space, 2)
     model.fit(dataset(space.cardinalities, 2, states, actions, following))
-    assert model.local.late.changing.tolist() == [0]
+    assert model.local.synchronic.changing.tolist() == [0]
     _, tests, chosen, _ = wanderers(1000, 1)
     drawn, _ = model.sample(tests, chosen, derive(5, np.arange(1000)))
     assert (drawn.sum(axis=1) == 2).mean() > 0.75  # 0.3 where every cell is drawn for itself
