@@ -44,7 +44,7 @@ from mbagent.models.protocol import TransitionModel
 from mbagent.models.registry import build_model
 from mbagent.models.reward import LearnedReward
 from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
-from mbagent.rewards import GoalBook, RewardFn
+from mbagent.rewards import RewardFn, RewardSelector
 from mbagent.spaces import ActionEnumeration, FactoredSpace
 from mbagent.training_log import check_progress, fit_progress, log_fit, log_rollout
 
@@ -183,7 +183,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
         self.policy = policy
         chosen = self.exploration_name
         self._explorer = EXPLORATIONS[chosen](actions.n) if isinstance(chosen, str) else chosen
-        self.goals = GoalBook(policy, self.experience)
+        self.goals = RewardSelector(policy, self.experience)
         if self.env is not None:
             self.goals.take_environment(self.env)
         start_states = getattr(model, "start_states", None)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mbagent import files
@@ -390,7 +391,7 @@ def _locked(folder: Path) -> AbstractContextManager[None]:
 
 _FLUSH = 256
 
-CHANCE = 1e-3
+REUSE_CHANCE = 1e-3
 """Episodes that all end where the next one starts are reported from this probability on that they do by chance."""
 
 
@@ -534,11 +535,11 @@ class ExperienceRecorder:
 
         That is so where all of them are the next episode's first, which is improbable by how often that one is observed.
         """
-        if not self._ends_at_starts or len(self._starts) < 2:
-            return
+        if not self._ends_at_starts or len(self._starts) < 2 or isinstance(self._space.space, spaces.Discrete):
+            return  # numbers cannot be overwritten
         observed, starts = np.sort(hash_rows(self._dataset.rows().states)), hash_rows(np.concatenate(self._starts[1:]))
         counts = np.searchsorted(observed, starts, side="right") - np.searchsorted(observed, starts, side="left")
-        if np.log(np.maximum(counts, 1) / len(observed)).sum() > np.log(CHANCE):
+        if np.log(np.maximum(counts, 1) / len(observed)).sum() > np.log(REUSE_CHANCE):
             return
         self._ends_at_starts = False
         warnings.warn(

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.systematic_sampling import RARE
+from mbagent.models.systematic_sampling import RARE_VALUE
 from mbagent.planning.planner import Planner, PlannerSettings
-from mbagent.planning.planners import MachinePlanner
-from mbagent.planning.trajectories import ForeseeingPlanner, Foresight, likeliest_futures
+from mbagent.planning.planners import ValueIterationPlanner
+from mbagent.planning.trajectories import PlanTrace, TracingPlanner, likeliest_trajectories
 from mbagent.policies import NO_GOAL, PlannerPolicy
 from mbagent.spaces import as_batch
 from mbagent.types import Floats, States
@@ -24,7 +24,7 @@ REPEATS = 8
 SHORT = 24
 """Observations whose text is at most this long stand in ``Explanation.table``."""
 
-_OTHER_LUCK = 0xE59A1
+_OTHER_SEEDS = 0xE59A1
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Explanation:
         machine_states: number of states of the reachable machine if it was solved as a whole; 0 if it is too large.
         futures: for each action its likeliest imagined futures, the likeliest first. After the action they follow the
             best behaviour found (with flat Monte Carlo, which has none, they are one step long).
-        rare: for each action the outcomes of less than ``RARE`` probability that take part in its value, those first that change
+        rare: for each action the outcomes less probable than ``RARE_VALUE`` that take part in its value, those first that change
             it most (with flat Monte Carlo, which has no values of them, the least likely first). Probabilities are posterior
             means, of counts where the model is learned from counts.
         effects: for each of these, what it adds to the action's value, compared with an outcome as good as the others are on
@@ -124,10 +124,10 @@ class Explanation:
             lines.append(f"{names[a]:>{width}}{figures}{'  <- taken' if a == self.best else ''}")
         for a in rows:
             lines.append(f"likeliest futures of action {names[a]}:")
-            lines += [f"  {future.probability:6.1%}  {_told(future)}" for future in self.futures[a]]
+            lines += [f"  {future.probability:6.1%}  {_described(future)}" for future in self.futures[a]]
             for step, effect in zip(self.rare[a], self.effects[a], strict=True):
                 lines.append(
-                    f"  {step.probability:6.2g}  {_told(Future((step,), step.probability))}: rare, {effect:+.3g} in value"
+                    f"  {step.probability:6.2g}  {_described(Future((step,), step.probability))}: rare, {effect:+.3g} in value"
                 )
         return "\n".join(lines)
 
@@ -151,7 +151,7 @@ def _explained(policy: PlannerPolicy, observation: Any, n_futures: int, n_steps:
     # A deadline, or the last decision's tree, would make two explanations of one observation differ.
     settings = replace(policy.settings, time_budget=None, reuse_tree=False)
     planner = _planner(policy, settings, policy.planner)
-    found = _foresee(planner, state)
+    found = _trace(planner, state)
     others = _other_values(policy, settings if found.machine_states else replace(settings, max_states=1), state, planner)
     values = np.concatenate([found.plan.values, *(plan_values for plan_values, _ in others)])
     taken = [int(found.plan.actions[0]), *(action for _, action in others)]
@@ -187,28 +187,28 @@ def _planner(policy: PlannerPolicy, settings: PlannerSettings, like: Planner) ->
     planner.set_model(policy.transition_model, policy.start_states)
     assert policy.goal is not None  # ``_single_state`` has seen to it
     planner.set_goal(policy.goal)
-    if isinstance(planner, MachinePlanner) and isinstance(like, MachinePlanner):
-        planner.look_ahead_as(like)
+    if isinstance(planner, ValueIterationPlanner) and isinstance(like, ValueIterationPlanner):
+        planner.share_config(like)
     return planner
 
 
-def _foresee(planner: Planner, state: States) -> Foresight:
-    if not isinstance(planner, ForeseeingPlanner):
+def _trace(planner: Planner, state: States) -> PlanTrace:
+    if not isinstance(planner, TracingPlanner):
         raise TypeError(f"explain() needs a planner with foresee(root), which {type(planner).__name__} has not.")
-    return planner.foresee(state)
+    return planner.trace(state)
 
 
 def _other_values(policy: PlannerPolicy, settings: PlannerSettings, state: States, like: Planner) -> list[tuple[Floats, int]]:
     """(values [1, A], action taken) of decisions with other random numbers."""
     found = []
     for repeat in range(1, REPEATS):
-        seed = int(derive(settings.seed, _OTHER_LUCK, repeat)[0] >> np.uint64(1))
+        seed = int(derive(settings.seed, _OTHER_SEEDS, repeat)[0] >> np.uint64(1))
         plan = _planner(policy, replace(settings, seed=seed), like).plan(state)
         found.append((plan.values, int(plan.actions[0])))
     return found
 
 
-def _steps(policy: PlannerPolicy, found: Foresight, edges: Sequence[int]) -> tuple[Step, ...]:
+def _steps(policy: PlannerPolicy, found: PlanTrace, edges: Sequence[int]) -> tuple[Step, ...]:
     """What some edges of the graph stand for."""
     if len(edges) == 0:
         return ()
@@ -226,15 +226,15 @@ def _steps(policy: PlannerPolicy, found: Foresight, edges: Sequence[int]) -> tup
     )
 
 
-def _futures(policy: PlannerPolicy, found: Foresight, n_futures: int, n_steps: int) -> tuple[tuple[Future, ...], ...]:
+def _futures(policy: PlannerPolicy, found: PlanTrace, n_futures: int, n_steps: int) -> tuple[tuple[Future, ...], ...]:
     def future(path: list[int]) -> Future:
         steps = _steps(policy, found, path)
         return Future(steps, float(np.prod([step.probability for step in steps])))
 
-    return tuple(tuple(map(future, paths)) for paths in likeliest_futures(found, n_futures, n_steps))
+    return tuple(tuple(map(future, paths)) for paths in likeliest_trajectories(found, n_futures, n_steps))
 
 
-def _rare(policy: PlannerPolicy, found: Foresight, most: int) -> dict[str, Any]:
+def _rare(policy: PlannerPolicy, found: PlanTrace, most: int) -> dict[str, Any]:
     """``rare`` and ``effects`` of Explanation, ``most`` of each action."""
     graph, steps, effects = found.graph, [], []
     for first, count in zip(graph.first[found.root], graph.counts[found.root], strict=True):
@@ -245,7 +245,7 @@ def _rare(policy: PlannerPolicy, found: Foresight, most: int) -> dict[str, Any]:
             worth = found.rewards[edges] + after
             others = ((chances * worth).sum() - chances * worth) / np.maximum(1.0 - chances, 1e-12)
             changes = chances * (worth - others)
-        kept = np.flatnonzero(chances < RARE)
+        kept = np.flatnonzero(chances < RARE_VALUE)
         kept = kept[np.lexsort((chances[kept], -np.abs(changes[kept])))][:most]
         steps.append(_steps(policy, found, edges[kept].tolist()))
         effects.append(tuple(changes[kept].tolist()))
@@ -261,7 +261,7 @@ def _row(batch: Any, index: int) -> Any:
     return batch[index]
 
 
-def _told(future: Future) -> str:
+def _described(future: Future) -> str:
     """A future as a line: actions, short observations, rewards other than 0, the end."""
     parts = []
     for step in future.steps:

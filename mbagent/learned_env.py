@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mbagent.arguments import check_count
 from mbagent.policies import NO_GOAL, PlannerPolicy
-from mbagent.rewards import GivenReward, RewardFn
+from mbagent.rewards import CallableReward, RewardFn
 from mbagent.spaces import as_batch
 from mbagent.types import Actions, States
 
@@ -66,7 +66,7 @@ class LearnedEnv(gym.Env[Any, Any]):
             raise ValueError(NO_GOAL)
         self.observation_space, self.action_space = agent.observation_space, agent.action_space
         self.model, self._space, self._actions = policy.transition_model, policy.factored, policy.actions
-        self._reward = policy.goal if reward_fn is None else GivenReward(reward_fn, policy.factored, policy.actions)
+        self._reward = policy.goal if reward_fn is None else CallableReward(reward_fn, policy.factored, policy.actions)
         self._starts, self._shares = _starts(agent)
         self.max_episode_steps = max_episode_steps
         self._rewards: dict[bytes, float] = {}

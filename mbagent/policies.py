@@ -17,7 +17,7 @@ from mbagent.models.protocol import TransitionModel
 from mbagent.models.reward import LearnedReward
 from mbagent.planning.flat_monte_carlo import FlatMonteCarlo, direct_model
 from mbagent.planning.planner import Plan, Planner, PlannerSettings
-from mbagent.planning.planners import MachinePlanner, MctsPlanner
+from mbagent.planning.planners import MctsPlanner, ValueIterationPlanner
 from mbagent.spaces import ActionEnumeration, FactoredSpace, as_batch
 from mbagent.types import Reward, States
 from mbagent_envs.random_keys import derive
@@ -78,7 +78,7 @@ class PlannerPolicy(BasePolicy):
             if self.planner_class is not FlatMonteCarlo:
                 raise ValueError("forecasts='direct' is for the FlatMonteCarloPolicy; other planners go step by step.")
             direct_model(model)
-        if settings.time_budget is not None and self.planner_class is MachinePlanner:
+        if settings.time_budget is not None and self.planner_class is ValueIterationPlanner:
             raise ValueError("time_budget is for policies that simulate; the ValueIterationPolicy goes by lookahead_states.")
         if settings.reuse_tree and not issubclass(self.planner_class, MctsPlanner):
             raise ValueError("reuse_tree is for the MctsPolicy; other planners keep no tree.")
@@ -248,7 +248,7 @@ class FlatMonteCarloPolicy(PlannerPolicy):
 class ValueIterationPolicy(PlannerPolicy):
     """Greedy on the values of the finite-state machine generated from the model (section 2)."""
 
-    planner_class = MachinePlanner
+    planner_class = ValueIterationPlanner
 
 
 def _part(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:

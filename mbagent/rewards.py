@@ -53,7 +53,7 @@ LARGEST_REWARD = 1e100
 """Largest absolute reward: what is planned with adds, multiplies and squares them."""
 
 
-class GivenReward:
+class CallableReward:
     """A user's or an environment's reward function, as a goal on factors.
 
     Args:
@@ -132,7 +132,7 @@ def reward_wrapper(env: VecEnv) -> str | None:
     return None
 
 
-class GoalBook:
+class RewardSelector:
     """Keeps the candidates for the goal and decides between them.
 
     With no custom reward the environment's own ``reward_fn`` is used if it has one and it reproduces every reward met
@@ -152,8 +152,8 @@ class GoalBook:
     def __init__(self, policy: PlannerPolicy, experience: Experience) -> None:
         """See the class."""
         self._policy, self._experience = policy, experience
-        self._custom: GivenReward | None = None
-        self._environment: GivenReward | None = None
+        self._custom: CallableReward | None = None
+        self._environment: CallableReward | None = None
         self._since = 0
         self._unusable = "There is no environment"
         self._changes_rewards: str | None = None
@@ -276,7 +276,7 @@ class GoalBook:
             return f"The environment's reward_fn differs from {int(wrong.sum())} of the {len(rows)} rewards met"
         return None
 
-    def _probe(self, reward: GivenReward) -> None:
+    def _probe(self, reward: CallableReward) -> None:
         """Tries a reward function on transitions met, or on the space's first observation."""
         rows = self._transitions.rows()
         if len(rows):
@@ -288,5 +288,5 @@ class GoalBook:
             states = self._policy.start_states[np.arange(3) % len(self._policy.start_states)]
         reward(states, np.zeros(3, dtype=np.int64), states)
 
-    def _given(self, fn: RewardFn) -> GivenReward:
-        return GivenReward(fn, self._policy.factored, self._policy.actions)
+    def _given(self, fn: RewardFn) -> CallableReward:
+        return CallableReward(fn, self._policy.factored, self._policy.actions)

@@ -15,27 +15,27 @@ from mbagent.types import Actions, Bools, Floats, Ints, States
 
 Values = NDArray[np.integer[Any]]
 
-LOOKED_AT = 8192
+MOST_COUNTED_STEPS = 8192
 """Transitions that are looked at; of more, evenly chosen ones."""
 
 CELLS, CAUSES = 1024, 512
 """Changes, and values of other factors, that are set against each other at most: the most frequent ones."""
 
-MOST_COUNTS, MOST_VALUE = 4_000_000, 65_535
+MOST_TABLE_COUNTS, MOST_VALUE = 4_000_000, 65_535
 """Numbers that are counted at once, and the largest value of a factor; one with more is neither steered nor cut into classes."""
 
-SHARE = 0.1
+LEAST_SHARE = 0.1
 """Of the changes of a factor that hangs on something, those that are expected to hang on it."""
 
-SURE = 5.0
+SURE_EVIDENCE = 5.0
 """Log evidence, beyond the logarithm of the number of questions, from which on a dependence is believed."""
 
-RARE = 16
+RARE_CHANGE = 16
 """What changed less often multiplies the states met by little, and what it hangs on is not to be told yet."""
 
 
 @dataclass(frozen=True)
-class Steered:
+class Controllable:
     """What was found of F factors.
 
     Attributes:
@@ -48,7 +48,7 @@ class Steered:
     classes: Mapping[int, Mapping[int, int]]
 
 
-class View:
+class StateAbstraction:
     """States as what matters of them: some factors as they are, of others only the class of each value.
 
     Args:
@@ -56,7 +56,7 @@ class View:
         whole: factors whose values are told apart in any case, bool [F].
     """
 
-    def __init__(self, found: Steered, whole: Bools) -> None:
+    def __init__(self, found: Controllable, whole: Bools) -> None:
         """See the class."""
         kept = whole.copy()
         some: list[int] = []
@@ -80,7 +80,7 @@ class View:
         known = np.minimum(states.take(self.some, axis=1), self.classes.shape[1] - 1)
         return np.concatenate([kept, self.classes[np.arange(len(self.some)), known]], axis=1)
 
-    def same_as(self, other: View | None) -> bool:
+    def same_as(self, other: StateAbstraction | None) -> bool:
         """Whether another tells the same states apart in the same words."""
         names = ("factors", "some", "classes")
         return other is not None and all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
@@ -103,7 +103,7 @@ class _Changes:
     ways: Ints
 
 
-def thinned(before: Values, actions: Actions, after: Values, most: int = LOOKED_AT) -> tuple[Values, Actions, Values]:
+def thinned(before: Values, actions: Actions, after: Values, most: int = MOST_COUNTED_STEPS) -> tuple[Values, Actions, Values]:
     """At most so many of some transitions, evenly chosen."""
     if len(actions) <= most:
         return before, actions, after
@@ -111,7 +111,7 @@ def thinned(before: Values, actions: Actions, after: Values, most: int = LOOKED_
     return before[some], actions[some], after[some]
 
 
-def find_steered(before: Values, actions: Actions, after: Values, n_actions: int) -> Steered:
+def find_controllable(before: Values, actions: Actions, after: Values, n_actions: int) -> Controllable:
     """Which of F factors hang on actions, and which values not even then.
 
     Each change is taken for itself: whether its probability, given the factor's present value, is another one after some action
@@ -126,12 +126,12 @@ def find_steered(before: Values, actions: Actions, after: Values, n_actions: int
     """
     before, actions, after = thinned(before, actions, after)
     changes = _all_changes(before, after)
-    enough = SURE + math.log(n_actions * max(1, sum(len(change.start) for change in changes.values())))
+    enough = SURE_EVIDENCE + math.log(n_actions * max(1, sum(len(change.start) for change in changes.values())))
     directly, classes = np.zeros(before.shape[1], dtype=np.bool_), {}
     contexts = _in_contexts(changes, before, actions, n_actions)
     for factor, change in changes.items():
         n_values, moved = int(change.value.max()) + 1, change.cell >= 0
-        if (n_values + len(change.start)) * n_actions > MOST_COUNTS or change.ways.max() > MOST_VALUE:
+        if (n_values + len(change.start)) * n_actions > MOST_TABLE_COUNTS or change.ways.max() > MOST_VALUE:
             classes[factor] = {int(value): int(value) for value in np.unique(before[:, factor])}
             continue
         pairs = change.value * n_actions + actions
@@ -142,10 +142,12 @@ def find_steered(before: Values, actions: Actions, after: Values, n_actions: int
         logs = _evidence(of_cell, of_value[change.start])
         directly[factor] = _speaks(logs).max() > enough or contexts[factor].any()
         odds = _evidence(of_cell, of_cell + staying[change.start])  # one change must not look steered for another that is
-        hanging = contexts[factor] | (odds.max(axis=1) > enough / (1 + directly[factor]))
-        times = np.where(staying.sum(axis=1)[change.start] < RARE, 0, of_cell.sum(axis=1))  # without both, odds tell nothing
-        classes[factor] = _classes(change.ways, times, hanging, before[:, factor], after[:, factor])
-    return Steered(directly, classes)
+        dependent = contexts[factor] | (odds.max(axis=1) > enough / (1 + directly[factor]))
+        times = np.where(
+            staying.sum(axis=1)[change.start] < RARE_CHANGE, 0, of_cell.sum(axis=1)
+        )  # without both, odds tell nothing
+        classes[factor] = _classes(change.ways, times, dependent, before[:, factor], after[:, factor])
+    return Controllable(directly, classes)
 
 
 def _in_contexts(changes: Mapping[int, _Changes], before: Values, actions: Actions, n_actions: int) -> dict[int, Bools]:
@@ -154,14 +156,18 @@ def _in_contexts(changes: Mapping[int, _Changes], before: Values, actions: Actio
     What comes from the left by one action and from the right by another does not hang on the action alone.
     """
     result, factors = {f: np.zeros(len(change.start), dtype=np.bool_) for f, change in changes.items()}, list(changes)
-    some = slice(None) if len(actions) <= LOOKED_AT // 2 else np.linspace(0, len(actions) - 1, LOOKED_AT // 2).astype(np.int64)
+    some = (
+        slice(None)
+        if len(actions) <= MOST_COUNTED_STEPS // 2
+        else np.linspace(0, len(actions) - 1, MOST_COUNTED_STEPS // 2).astype(np.int64)
+    )
     of_cells, kept = _columns([changes[f].cell[some] for f in factors], CELLS)
     stays = [np.where(changes[f].cell[some] < 0, changes[f].value[some], -1) for f in factors]
     of_values, kept_values = _columns(stays, CELLS)
     place = {(f, number): column for column, (f, number) in enumerate(kept_values.tolist())}
     begun = np.array([place.get((f, int(changes[factors[f]].start[cell])), -1) for f, cell in kept.tolist()], dtype=np.int64)
     of_cells, kept, begun = of_cells[:, begun >= 0], kept[begun >= 0], begun[begun >= 0]
-    most = min(CAUSES, MOST_COUNTS // (n_actions * max(1, len(begun))))
+    most = min(CAUSES, MOST_TABLE_COUNTS // (n_actions * max(1, len(begun))))
     causes, _ = _columns([np.unique(before[some, f], return_inverse=True)[1] for f in factors], most, even=True)
     if not len(begun) or not causes.shape[1]:
         return result
@@ -170,23 +176,23 @@ def _in_contexts(changes: Mapping[int, _Changes], before: Values, actions: Actio
         np.stack([np.rint(columns[own].T @ causes[own]) for own in chosen]).astype(np.int64) for columns in (of_cells, of_values)
     )
     n = n[:, begun] + k
-    enough, all_k, all_n = SURE + math.log(k.size), k.sum(axis=0), n.sum(axis=0)
-    hanging = np.max([(_evidence(k[a], n[a], all_k, all_n)).max(axis=1) for a in range(n_actions)], axis=0) > enough
-    for f, cell in kept[hanging].tolist():
+    enough, all_k, all_n = SURE_EVIDENCE + math.log(k.size), k.sum(axis=0), n.sum(axis=0)
+    dependent = np.max([(_evidence(k[a], n[a], all_k, all_n)).max(axis=1) for a in range(n_actions)], axis=0) > enough
+    for f, cell in kept[dependent].tolist():
         result[factors[f]][cell] = True
     return result
 
 
-def _classes(ways: Ints, times: Ints, hanging: Bools, *met: NDArray[Any]) -> dict[int, int]:
+def _classes(ways: Ints, times: Ints, dependent: Bools, *met: NDArray[Any]) -> dict[int, int]:
     """The lowest value of each value's class; what changed too few ``times`` to tell whether it hangs on actions stays apart."""
     both: dict[tuple[int, int], int] = {}
-    apart = {(min(pair), max(pair)) for pair in ways[hanging].tolist()}
+    apart = {(min(pair), max(pair)) for pair in ways[dependent].tolist()}
     for pair, n in zip(ways.tolist(), times.tolist(), strict=True):
         key = min(pair), max(pair)
         both[key] = both.get(key, 0) + n
     lowest = {int(value): int(value) for value in np.unique(np.concatenate(met))}
     for (low, high), n in sorted(both.items()):
-        if n >= RARE and (low, high) not in apart:
+        if n >= RARE_CHANGE and (low, high) not in apart:
             one, other = lowest[low], lowest[high]
             merged = {value for value, name in lowest.items() if name in (one, other)}
             if not any(a in merged and b in merged for a, b in apart):
@@ -194,14 +200,14 @@ def _classes(ways: Ints, times: Ints, hanging: Bools, *met: NDArray[Any]) -> dic
     return lowest
 
 
-def find_reached(found: Steered, before: Values, actions: Actions, after: Values) -> Bools:
+def find_reached(found: Controllable, before: Values, actions: Actions, after: Values) -> Bools:
     """Factors that hang on actions, or on others of which this is true, bool [F].
 
-    The latter is asked as ``find_steered`` asks: whether a change is more or less probable beside some value of the other factor.
+    As in ``find_controllable``: whether a change is more or less probable beside some value of the other factor.
     """
-    before, _, after = thinned(before, actions, after, LOOKED_AT // 2)
+    before, _, after = thinned(before, actions, after, MOST_COUNTED_STEPS // 2)
     changes, reached, new = _all_changes(before, after), found.directly.copy(), found.directly
-    rest = [f for f, change in changes.items() if not reached[f] and (change.cell >= 0).sum() >= RARE]
+    rest = [f for f, change in changes.items() if not reached[f] and (change.cell >= 0).sum() >= RARE_CHANGE]
     if not rest or not new.any():
         return reached
     of_values, kept_values = _columns([changes[f].value for f in rest], CELLS)
@@ -216,7 +222,7 @@ def find_reached(found: Steered, before: Values, actions: Actions, after: Values
         logs = _evidence(k[:, :-1], n[begun, :-1], k[:, -1:], n[begun, -1:])
         new = np.zeros_like(reached)
         for f in np.unique(owner):
-            new[f] = not reached[f] and _speaks(logs[owner == f]).max() > SURE + math.log(logs.size)
+            new[f] = not reached[f] and _speaks(logs[owner == f]).max() > SURE_EVIDENCE + math.log(logs.size)
         reached |= new
     return reached
 
@@ -257,9 +263,9 @@ def _columns(numbers: list[Ints], most: int, even: bool = False) -> tuple[NDArra
 
 @cache
 def _log_gammas() -> Floats:
-    """Of 1/2, 3/2, ..., minus that of 1/2; and below it of 1, 2, 3, ...: [2, LOOKED_AT + 1]."""
-    halves = np.concatenate([[0.0], np.cumsum(np.log(np.arange(LOOKED_AT) + 0.5))])
-    wholes = np.concatenate([[0.0], np.cumsum(np.log(np.arange(LOOKED_AT) + 1.0))])
+    """Of 1/2, 3/2, ..., minus that of 1/2; and below it of 1, 2, 3, ...: [2, MOST_COUNTED_STEPS + 1]."""
+    halves = np.concatenate([[0.0], np.cumsum(np.log(np.arange(MOST_COUNTED_STEPS) + 0.5))])
+    wholes = np.concatenate([[0.0], np.cumsum(np.log(np.arange(MOST_COUNTED_STEPS) + 1.0))])
     return np.stack([halves, wholes])
 
 
@@ -286,6 +292,6 @@ def _evidence(k: Ints, n: Ints, all_k: Ints | None = None, all_n: Ints | None = 
 
 def _speaks(logs: Floats) -> Floats:
     """Log evidence [G] of a factor's changes [C, G], that one alone hangs on it, or a share of them."""
-    together = np.logaddexp(math.log(1.0 - SHARE), math.log(SHARE) + logs).sum(axis=0)
+    together = np.logaddexp(math.log(1.0 - LEAST_SHARE), math.log(LEAST_SHARE) + logs).sum(axis=0)
     result: Floats = np.maximum(logs.max(axis=0), together)
     return result

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.data import TransitionBatch, TransitionDataset
-from mbagent.exploration.controllability import View, find_reached, find_steered
-from mbagent.exploration.visit_counts import START, VisitTable
+from mbagent.exploration.controllability import StateAbstraction, find_controllable, find_reached
+from mbagent.exploration.visit_counts import START_NODE, VisitTable
 from mbagent.types import Actions, Bools, States
 
 FEW_STATES, STEPS_PER_STATE = 64, 8
@@ -23,10 +23,10 @@ MANY_STATES = 50_000
 MANY_VALUES = 40_000_000
 """Values of factors, mostly of a byte each, that are kept to look at which of them actions reach."""
 
-FIRST_LOOK = 256
+FIRST_COUNT = 256
 """Steps before the first look, if there are too many states by then."""
 
-TOGETHER = 256
+STEPS_TOGETHER = 256
 """Steps that are counted at once while they direct nothing."""
 
 
@@ -124,14 +124,14 @@ class DirectedExploration:
     def __init__(self, n_actions: int, few: bool = False) -> None:
         """See the class."""
         self.table: VisitTable | None = VisitTable(n_actions)
-        self.view: View | None = None
+        self.view: StateAbstraction | None = None
         self.n_steps = 0
         self._few, self._random = few, RandomExploration(n_actions)
         self._uncounted: list[_Steps] = []
         self._unkept: list[_Steps] = []
         self._kept: list[_Steps] | None = []
         self._n_uncounted, self._n_unkept, self._n_kept = 0, 0, 0
-        self._look_at = FIRST_LOOK
+        self._reconsider_at = FIRST_COUNT
         self._ended = np.ones(0, dtype=np.bool_)
 
     @property
@@ -164,28 +164,28 @@ class DirectedExploration:
 
     def _take(self, steps: _Steps) -> None:
         self.n_steps += len(steps.actions)
-        look = self.n_steps >= self._look_at
+        look = self.n_steps >= self._reconsider_at
         if self._kept is not None:
             self._unkept.append(steps)
             self._n_unkept += len(steps.actions)
-            if look or self._n_unkept >= TOGETHER:
+            if look or self._n_unkept >= STEPS_TOGETHER:
                 self._keep(self._kept)
         if self.table is not None:
             self._uncounted.append(steps)
             self._n_uncounted += len(steps.actions)
-            if look or self.directed or self._n_uncounted >= TOGETHER:  # many steps at once cost less for each
+            if look or self.directed or self._n_uncounted >= STEPS_TOGETHER:  # many steps at once cost less for each
                 self._count(self.table, _joined(self._uncounted))
                 self._uncounted, self._n_uncounted = [], 0
         if look:
-            self._look_at = 2 * self.n_steps
-            self._look()
+            self._reconsider_at = 2 * self.n_steps
+            self._reconsider()
 
     def _nodes(self, table: VisitTable, states: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
         return table.add(states.astype(np.int64, copy=False) if self.view is None else self.view(states))
 
     def _count(self, table: VisitTable, steps: _Steps) -> None:
         """Enters steps into the table."""
-        nodes, targets = self._nodes(table, steps.states), np.full(len(steps.states), START)
+        nodes, targets = self._nodes(table, steps.states), np.full(len(steps.states), START_NODE)
         targets[~steps.ended] = self._nodes(table, steps.next_states[~steps.ended])
         table.begin(nodes[steps.began])
         table.record(nodes, steps.actions, targets)
@@ -198,10 +198,10 @@ class DirectedExploration:
         self._unkept, self._n_unkept = [], 0
         self._n_kept += 2 * kept[-1].states.size
         if self._n_kept > MANY_VALUES:
-            self._look()
+            self._reconsider()
             self._kept = None
 
-    def _look(self) -> None:
+    def _reconsider(self) -> None:
         """Settles how states are told apart: by all, if they are few then; else by what actions reach; else by what they do."""
         if self._kept is None or (self.view is None and self.directed):
             return
@@ -211,11 +211,11 @@ class DirectedExploration:
             view = None
         else:
             met = steps.states, steps.actions, steps.next_states
-            found = find_steered(*met, self._random.n_actions)
-            view = View(found, np.zeros_like(found.directly))
+            found = find_controllable(*met, self._random.n_actions)
+            view = StateAbstraction(found, np.zeros_like(found.directly))
             if not found.directly.any() or _distinct(view(steps.states)) > self._most:
                 return
-            finer = View(found, find_reached(found, *met))
+            finer = StateAbstraction(found, find_reached(found, *met))
             view = finer if _distinct(finer(steps.states)) <= self._most else view
         if self.table is None or not (view.same_as(self.view) if view is not None else self.view is None):
             self.view, self.table = view, VisitTable(self._random.n_actions)

@@ -21,7 +21,7 @@ TIE = 1e-6
 WORK = 4096
 """Pairs and outcomes looked at in each step, at most: some tens of microseconds."""
 
-START = 0
+START_NODE = 0
 """The node that stands for "a new episode begins"."""
 
 
@@ -29,7 +29,7 @@ class VisitArrays(NamedTuple):
     """What compiled code needs of a VisitTable, with room to grow; N nodes and M outcomes of them are in use.
 
     Attributes:
-        tried: how often each action was taken, int64 [room, A]; of node START, column 0, how many episodes began.
+        tried: how often each action was taken, int64 [room, A]; of node START_NODE, column 0, how many episodes began.
         first: number of the first outcome of each (node, action), -1 where there is none, int64 [room, A].
         worth: discounted sum of the bonuses that can be had from a node on, float64 [room].
         target: the node that an outcome leads to, int64 [room].
@@ -84,10 +84,10 @@ class VisitTable:
 
     def begin(self, nodes: Ints) -> None:
         """Episodes began at these nodes [B]."""
-        self._count(np.full(len(nodes), START), np.zeros(len(nodes), dtype=np.int64), nodes)
+        self._count(np.full(len(nodes), START_NODE), np.zeros(len(nodes), dtype=np.int64), nodes)
 
     def record(self, nodes: Ints, actions: Actions, targets: Ints) -> None:
-        """Actions [B] taken at nodes [B] led to others [B]; to START where the episode ended."""
+        """Actions [B] taken at nodes [B] led to others [B]; to START_NODE where the episode ended."""
         self._count(nodes, actions, targets)
 
     def _count(self, nodes: Ints, actions: Actions, targets: Ints) -> None:
@@ -112,15 +112,15 @@ class VisitTable:
         """Number of distinct (state, action) that were tried."""
         return int((self._arrays.tried[1 : len(self) + 1] > 0).sum())
 
-    def choose(self, nodes: Ints, luck: Floats) -> Actions:
+    def choose(self, nodes: Ints, noise: Floats) -> Actions:
         """The actions int64 [B] of most worth, after value iteration went on a little; rows at the same node share them out.
 
         Args:
             nodes: int64 [B].
-            luck: float64 [B, A], uniform in [0, 1), to choose between equals.
+            noise: float64 [B, A], uniform in [0, 1), to choose between equals.
         """
         actions = np.empty(len(nodes), dtype=np.int64)
-        self._at, self._upwards = _choose(self._arrays, nodes, luck, self._at, self._upwards, actions)
+        self._at, self._upwards = _choose(self._arrays, nodes, noise, self._at, self._upwards, actions)
         return actions
 
 
@@ -160,12 +160,12 @@ def _record(table: VisitArrays, nodes: Ints, actions: Actions, targets: Ints) ->
 @compiled
 def _mean(table: VisitArrays, node: int, action: int) -> tuple[float, int]:
     """Mean worth of what an action that was tried led to, and the number of its distinct outcomes."""
-    total, looked, outcome = 0.0, 0, table.first[node, action]
+    total, counted, outcome = 0.0, 0, table.first[node, action]
     while outcome >= 0:
         total += table.times[outcome] * table.worth[table.target[outcome]]
-        looked += 1
+        counted += 1
         outcome = table.following[outcome]
-    return total / table.tried[node, action], looked
+    return total / table.tried[node, action], counted
 
 
 @compiled
@@ -173,19 +173,19 @@ def _improve(table: VisitArrays, work: int, at: int, upwards: bool) -> tuple[int
     """Sweeps to and fro over the nodes, in place, from node ``at`` on; returns where to go on."""
     n = table.sizes[0]
     for _ in range(2 * n):
-        if at == START:
-            if table.tried[START, 0] > 0:
-                table.worth[START], looked = _mean(table, START, 0)
-                work -= looked
+        if at == START_NODE:
+            if table.tried[START_NODE, 0] > 0:
+                table.worth[START_NODE], counted = _mean(table, START_NODE, 0)
+                work -= counted
         else:
             best = 0.0
             for a in range(table.tried.shape[1]):
                 if table.tried[at, a] == 0:
                     best = UNTRIED
                     break
-                mean, looked = _mean(table, at, a)
+                mean, counted = _mean(table, at, a)
                 best = max(best, 1.0 / np.sqrt(table.tried[at, a]) + DISCOUNT * mean)
-                work -= looked
+                work -= counted
             table.worth[at] = best
             work -= table.tried.shape[1]
         at += 1 if upwards else -1
@@ -198,7 +198,7 @@ def _improve(table: VisitArrays, work: int, at: int, upwards: bool) -> tuple[int
 
 
 @compiled
-def _choose(table: VisitArrays, nodes: Ints, luck: Floats, at: int, upwards: bool, actions: Actions) -> tuple[int, bool]:
+def _choose(table: VisitArrays, nodes: Ints, noise: Floats, at: int, upwards: bool, actions: Actions) -> tuple[int, bool]:
     """Fills ``actions`` [B], see VisitTable.choose; each counts as a try for the rows after it. Returns as _improve does."""
     at, upwards = _improve(table, WORK, at, upwards)
     for b in range(len(nodes)):
@@ -210,7 +210,7 @@ def _choose(table: VisitArrays, nodes: Ints, luck: Floats, at: int, upwards: boo
             score = UNTRIED / (1.0 + taken)
             if n > 0:
                 score = 1.0 / np.sqrt(n + taken) + DISCOUNT * _mean(table, nodes[b], a)[0]
-            score += TIE * luck[b, a]
+            score += TIE * noise[b, a]
             if score > best:
                 best, actions[b] = score, a
     return at, upwards

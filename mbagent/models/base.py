@@ -108,7 +108,7 @@ class BaseTransitionModel(ABC):
         return values.mean(axis=1), values.var(axis=1, ddof=1)
 
 
-class KnownModel(BaseTransitionModel):
+class ExactModel(BaseTransitionModel):
     """A model of known rules: ``fit`` does nothing and ``state_dict`` is empty; see BaseTransitionModel for the arguments."""
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:

@@ -170,10 +170,10 @@ class ConditionalBoltzmannMachine(BaseTransitionModel):
         logits = codec.logits(torch.zeros(len(inputs), codec.n_columns, dtype=torch.float64))
         factors = _choose(logits, uniforms(keys, len(codec.outputs)))
         for step in range(self.config.burn_in):
-            luck = uniforms(derive(keys, step), self.config.hidden + len(codec.outputs))
+            noise = uniforms(derive(keys, step), self.config.hidden + len(codec.outputs))
             drive = codec.targets(factors).double() @ w["W"].T + to_hidden
-            hidden = (torch.from_numpy(luck[:, : self.config.hidden]) < torch.sigmoid(drive)).double()
-            factors = _choose(codec.logits(hidden @ w["W"] + from_inputs), luck[:, self.config.hidden :])
+            hidden = (torch.from_numpy(noise[:, : self.config.hidden]) < torch.sigmoid(drive)).double()
+            factors = _choose(codec.logits(hidden @ w["W"] + from_inputs), noise[:, self.config.hidden :])
         result = factors.numpy()
         return np.ascontiguousarray(result[:, :-1]), result[:, -1] == 1
 
@@ -236,7 +236,7 @@ def _tensors(states: States, actions: Actions) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(np.ascontiguousarray(states, dtype=np.int64)), torch.from_numpy(np.asarray(actions, dtype=np.int64))
 
 
-def _choose(logits: Tensor, luck: Floats) -> Tensor:
+def _choose(logits: Tensor, noise: Floats) -> Tensor:
     """The value [B, O] of each factor at luck [B, O] of its distribution function."""
     cumulated = torch.softmax(logits, dim=2).cumsum(dim=2)
-    return (torch.from_numpy(luck)[:, :, None] >= cumulated[:, :, :-1]).sum(dim=2)
+    return (torch.from_numpy(noise)[:, :, None] >= cumulated[:, :, :-1]).sum(dim=2)

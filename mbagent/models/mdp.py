@@ -22,7 +22,7 @@ from mbagent_envs.random_keys import derive, mix
 FEWEST_SLOTS = 1024
 """Places of the smallest hash table."""
 
-AT_ONCE = 16_384
+NODES_AT_ONCE = 16_384
 """Successors that room is made for at once, unless one state may have more; a node takes 16 bytes for each action."""
 
 
@@ -299,7 +299,7 @@ class StateGraph:
             key, offset = grid_of(seed)
             of_one = most_outcomes(self.model.n_actions, n_samples)
             while len(nodes):
-                most = of_one * max(1, min(len(nodes), AT_ONCE // of_one))
+                most = of_one * max(1, min(len(nodes), NODES_AT_ONCE // of_one))
                 self.reserve(most, most)
                 nodes = nodes[_expand_all(self.kernel, self.arrays, nodes, n_samples, key, offset) :]
         elif len(nodes):

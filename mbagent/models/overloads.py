@@ -15,7 +15,7 @@ from numba import types
 from numba.extending import overload
 from numpy.typing import NDArray
 
-_F = TypeVar("_F", bound=Callable[..., Any])
+_Kernel = TypeVar("_Kernel", bound=Callable[..., Any])
 
 
 class Outcomes(NamedTuple):
@@ -68,10 +68,10 @@ def outcomes(kernel: Any, work: Any, state: Any, n_grid: int, key: Any, offset: 
     raise NotImplementedError
 
 
-def implements(function: Callable[..., Any], kernel_type: type) -> Callable[[_F], _F]:
+def implements(function: Callable[..., Any], kernel_type: type) -> Callable[[_Kernel], _Kernel]:
     """Makes a compiled function the overload of one of the functions above for a type of kernel."""
 
-    def register(compiled_function: _F) -> _F:
+    def register(compiled_function: _Kernel) -> _Kernel:
         names = function.__code__.co_varnames[: function.__code__.co_argcount]
         arguments = ", ".join(names)
         # numba wants the very argument names of the function that is overloaded
@@ -85,4 +85,4 @@ def implements(function: Callable[..., Any], kernel_type: type) -> Callable[[_F]
         overload(function, strict=False)(choose)
         return compiled_function
 
-    return cast("Callable[[_F], _F]", register)
+    return cast("Callable[[_Kernel], _Kernel]", register)

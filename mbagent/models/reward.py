@@ -116,7 +116,7 @@ MAX_CLASSES = 64
 MAX_GRAPHS = 16
 """Up to this many distinct rewards are told apart by decision graphs, where these do better than a network."""
 
-STEPS, BATCH, LEARNING_RATE = 1500, 256, 0.01
+TRAINING_STEPS, BATCH, LEARNING_RATE = 1500, 256, 0.01
 
 FLOOR = 0.01
 """A network's probabilities of rewards under this count as none, where that does not explain the rewards worse."""
@@ -242,7 +242,7 @@ class LearnedReward:
                 misses = self._missed(rows) > 0 or (not held.any() and self._share_right(distinct, weights) < 1.0)
                 self._graphs = None if misses else self._graphs
             if self._graphs is None:
-                self._train(distinct, torch.from_numpy(weights), STEPS // 2 if trained else STEPS)
+                self._train(distinct, torch.from_numpy(weights), TRAINING_STEPS // 2 if trained else TRAINING_STEPS)
         right = self._share_right(distinct, weights)
         return RewardReport(len(values), right, held_out, _contrary(rows))
 
@@ -275,7 +275,7 @@ class LearnedReward:
 
     def _train_on(self, rows: TransitionBatch) -> None:
         distinct, weights = _distinct(rows)
-        self._train(distinct, torch.from_numpy(weights), STEPS)
+        self._train(distinct, torch.from_numpy(weights), TRAINING_STEPS)
 
     def _missed(self, rows: TransitionBatch) -> int:
         """Number of rows that earn something else than most do, and are told as if they did not.

@@ -19,11 +19,11 @@ ORDERS, TIMES = 20, 1.75
 """Other orders of the blocks, and how many times their greatest evidence a change needs."""
 
 
-LONG, BLOCKS = 1000, 50
+LONG_EPISODE, MOST_EPISODE_BLOCKS = 1000, 50
 """Blocks are episodes; those that are longer than so many rows, or than this share of all, are cut."""
 
 
-SURE = 10.0
+CHANGE_EVIDENCE = 10.0
 """Nats of evidence that a change needs beyond what other orders have."""
 
 
@@ -66,7 +66,7 @@ def turn(groups: Ints, values: Ints, episodes: Ints) -> int:
         order = np.argsort(rng.permutation(blocks[-1] + 1)[blocks], kind="stable")
         best = max(best, float(_gains(groups[order], labels[order], kinds).max()))
     found = int(gains.argmax())
-    return int(varied[found + 1]) if gains[found] > SURE + TIMES * best else 0
+    return int(varied[found + 1]) if gains[found] > CHANGE_EVIDENCE + TIMES * best else 0
 
 
 def still_hold(cells: Ints, values: Ints, since: int) -> Bools:
@@ -116,6 +116,6 @@ def _blocks(episodes: Ints) -> Ints:
     n, rows = len(episodes), np.arange(len(episodes))
     first = np.flatnonzero(np.r_[True, episodes[1:] != episodes[:-1]])
     begun = first[np.searchsorted(first, rows, side="right") - 1]
-    length = min(max(n // BLOCKS, 1), LONG)
+    length = min(max(n // MOST_EPISODE_BLOCKS, 1), LONG_EPISODE)
     blocks: Ints = np.unique(begun + (rows - begun) // length * length, return_inverse=True)[1].ravel()
     return blocks

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.base import KnownModel
+from mbagent.models.base import ExactModel
 from mbagent.models.protocol import Successors, as_keys
 from mbagent.models.systematic_sampling import thin
 from mbagent.spaces import FactoredSpace
@@ -14,7 +14,7 @@ from mbagent_envs import Game
 from mbagent_envs.random_keys import derive
 
 
-class SimulatorModel(KnownModel):
+class SimulatorModel(ExactModel):
     """A game's true dynamics. There is nothing to learn: ``fit`` does nothing and ``state_dict`` is empty.
 
     Args:

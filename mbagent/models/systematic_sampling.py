@@ -51,16 +51,16 @@ NEGLIGIBLE = 0.01
 """Probabilities under this share of the variable's largest are taken for noise of the fit, which planners would exploit: they
 count as 0. Decision graphs do so only where no observation stands behind them; networks cannot tell, and do so always."""
 
-RARE, TOGETHER = 0.05, 0.25
+RARE_VALUE, RARE_TOGETHER = 0.05, 0.25
 """Values of less than the first probability get strata of their own, those that together have less than the second."""
 
-ENOUGH = 4.0
+ENOUGH_POINTS = 4.0
 """Values that so many grid points are expected for are not rare: points tell more of what comes with them than a stratum does."""
 
-CHUNK = 2048
+LARGEST_CHUNK = 2048
 """Rows worked on at once; bounds the memory."""
 
-MAIN, STRATA, EXACT, MERGES, PLACE = range(5)
+MAIN, STRATA, LISTED, MERGES, PLACE = range(5)
 """Entries of ``Particles.state``: numbers of main particles and of strata, whether all outcomes are listed, merges so far, and a
 number of the state, on which it depends which strata are merged: else the same would be missing everywhere."""
 
@@ -77,10 +77,10 @@ Grid: TypeAlias = tuple[int, np.uint64, float]
 """Number of grid points, the key of their random numbers, and the grid's offset; see ``start``."""
 
 
-FIRST, POINTS, TAG = range(3)
+FIRST_POINT, POINTS, TAG = range(3)
 """Columns of ``Particles.grid``: lowest grid point, number of grid points, which stratum."""
 
-LOW, HIGH, MASS, SHARE = range(4)
+LOW, HIGH, MASS, ORIGINAL_SHARE = range(4)
 """Columns of ``Particles.chances``: ends of the interval of [0, 1) that the points lie in; exact probability of the outcome so
 far, of a stratum all of its weight; probability that no value so far was rare, of a stratum its own probability."""
 
@@ -89,7 +89,7 @@ class Particles(NamedTuple):
     """The particles of one row. Few arrays: handing them from function to function costs time, and to compile that even more.
 
     Attributes:
-        grid: see FIRST, int64 [2 n, 3].
+        grid: see FIRST_POINT, int64 [2 n, 3].
         chances: see LOW, [2 n, 4].
         factors: values of the row's open variables so far, int64 [2 n, O], in order.
         rare: probabilities of the values of a variable that are set apart, [K].
@@ -128,7 +128,14 @@ def new_particles(n_grid: int, n_outputs: int, n_values: int) -> Particles:
 @inlined
 def begin(p: Particles, n_grid: int, exact: bool, place: int) -> None:
     """One particle with all points. ``exact``: there is room to list all outcomes, at most 2 n. ``place``: see PLACE."""
-    p.grid[0, FIRST], p.grid[0, POINTS], p.chances[0, LOW], p.chances[0, HIGH], p.chances[0, MASS], p.chances[0, SHARE] = (
+    (
+        p.grid[0, FIRST_POINT],
+        p.grid[0, POINTS],
+        p.chances[0, LOW],
+        p.chances[0, HIGH],
+        p.chances[0, MASS],
+        p.chances[0, ORIGINAL_SHARE],
+    ) = (
         0,
         n_grid,
         0.0,
@@ -136,7 +143,7 @@ def begin(p: Particles, n_grid: int, exact: bool, place: int) -> None:
         1.0,
         1.0,
     )
-    p.state[MAIN], p.state[STRATA], p.state[EXACT], p.state[MERGES] = 1, 0, int(exact), 0
+    p.state[MAIN], p.state[STRATA], p.state[LISTED], p.state[MERGES] = 1, 0, int(exact), 0
     p.state[PLACE], p.left[0] = place, 0.0
 
 
@@ -210,16 +217,16 @@ def n_possible(values: Floats, start: int, n: int) -> int:
 def _set_apart(values: Floats, rare: Floats, n: int, n_grid: int) -> float:
     """Moves the rare values [n] to ``rare`` [n], scales the others to sum to one; returns the probability of all rare ones.
 
-    Rare are those that are less probable than some bound, at most RARE or what ENOUGH says, and together have less than TOGETHER;
-    of equally probable ones all or none.
+    Rare values are less probable than some bound, at most RARE_VALUE or ENOUGH_POINTS grid points, and together less probable
+    than RARE_TOGETHER; of equally probable values all are rare or none.
     """
-    bound, total = min(RARE, ENOUGH / n_grid), TOGETHER
-    while total >= TOGETHER:
+    bound, total = min(RARE_VALUE, ENOUGH_POINTS / n_grid), RARE_TOGETHER
+    while total >= RARE_TOGETHER:
         total = 0.0
         for k in range(n):
             if values[k] < bound:
                 total += values[k]
-        if total >= TOGETHER:
+        if total >= RARE_TOGETHER:
             bound *= 0.5
     for k in range(n):
         rare[k] = 0.0
@@ -247,7 +254,7 @@ def share_out(p: Particles, only: int, unit: int, w: int, values: Floats, n: int
     """
     points, chances, factors, apart, state = p.grid, p.chances, p.factors, p.rare, p.state
     n_grid, n_main, rare = grid[0], state[MAIN], 0.0
-    if state[EXACT]:
+    if state[LISTED]:
         for q in range(n_main if only < 0 else 1):
             _list_values(p, max(q, only), w, values, n)
         return
@@ -259,12 +266,12 @@ def share_out(p: Particles, only: int, unit: int, w: int, values: Floats, n: int
     rare = _set_apart(values, apart, n, n_grid)
     for i in range(n_main if only < 0 else 1):
         q = max(i, only)
-        here = points[q, POINTS] / n_grid * chances[q, SHARE]
+        here = points[q, POINTS] / n_grid * chances[q, ORIGINAL_SHARE]
         for k in range(n if rare > 0.0 else 0):
             if apart[k] > 0.0:
                 _add_stratum(p, q, unit, k, w, here * apart[k], ends, grid)
         chances[q, MASS] *= 1.0 - rare
-        chances[q, SHARE] *= 1.0 - rare
+        chances[q, ORIGINAL_SHARE] *= 1.0 - rare
         state[MAIN] = _split(p, q, state[MAIN], unit, w, values, n, grid)
 
 
@@ -294,12 +301,12 @@ def _split(p: Particles, q: int, n_live: int, i: int, w: int, values: Floats, n:
     points, chances, factors = p.grid, p.chances, p.factors
     n_grid, key, offset = grid
     if points[q, POINTS] == 1:
-        chosen = draw(values, n, uniform_at(derive_one(key, np.uint64(points[q, FIRST])), i))
+        chosen = draw(values, n, uniform_at(derive_one(key, np.uint64(points[q, FIRST_POINT])), i))
         factors[q, w] = chosen
         chances[q, MASS] *= values[chosen]
         return n_live
     low, width, mass = chances[q, LOW], chances[q, HIGH] - chances[q, LOW], chances[q, MASS]
-    point, left, below = points[q, FIRST], points[q, POINTS], 0.0
+    point, left, below = points[q, FIRST_POINT], points[q, POINTS], 0.0
     slot, last = q, n - 1
     while values[last] <= 0.0:
         last -= 1
@@ -315,12 +322,12 @@ def _split(p: Particles, q: int, n_live: int, i: int, w: int, values: Floats, n:
             n_live += 1
             for v in range(w):
                 factors[slot, v] = factors[q, v]
-        points[slot, FIRST], points[slot, POINTS], factors[slot, w] = point, taken, k
-        chances[slot, LOW], chances[slot, HIGH], chances[slot, MASS], chances[slot, SHARE] = (
+        points[slot, FIRST_POINT], points[slot, POINTS], factors[slot, w] = point, taken, k
+        chances[slot, LOW], chances[slot, HIGH], chances[slot, MASS], chances[slot, ORIGINAL_SHARE] = (
             lower,
             upper,
             mass * values[k],
-            chances[q, SHARE],
+            chances[q, ORIGINAL_SHARE],
         )
         slot = -1
         point += taken
@@ -361,15 +368,15 @@ def _add_stratum(p: Particles, q: int, unit: int, k: int, w: int, weight: float,
         state[MERGES] += 1
         kept = uniform_at(derive_one(key, _MERGE + np.uint64(state[PLACE])), state[MERGES]) * total >= weight
         if points[slot, TAG] != tag:
-            p.left[0] += weight if kept else chances[slot, SHARE]
-            chances[slot, SHARE] = chances[slot, SHARE] if kept else weight
+            p.left[0] += weight if kept else chances[slot, ORIGINAL_SHARE]
+            chances[slot, ORIGINAL_SHARE] = chances[slot, ORIGINAL_SHARE] if kept else weight
         else:
-            chances[slot, SHARE] += weight
+            chances[slot, ORIGINAL_SHARE] += weight
         if kept:
             chances[slot, MASS] = total
             return
     else:
-        chances[slot, SHARE] = weight
+        chances[slot, ORIGINAL_SHARE] = weight
     for v in range(w):
         factors[slot, v] = factors[q, v]
     factors[slot, w], chances[slot, MASS], points[slot, TAG] = k, total, tag
@@ -383,11 +390,11 @@ def weigh(p: Particles, n_grid: int) -> None:
     probable one has that of a grid point: what it was found with (Hájek 1971: mass by the chance of being found, scaled).
     """
     points, chances, n_main, total = p.grid, p.chances, p.state[MAIN], 0.0
-    if not p.state[EXACT]:
+    if not p.state[LISTED]:
         wanted, weights = 0.0, 0.0
         for q in range(n_main):
-            wanted += points[q, POINTS] / n_grid * chances[q, SHARE]
-            chances[q, MASS] = max(chances[q, MASS], chances[q, SHARE] / n_grid)
+            wanted += points[q, POINTS] / n_grid * chances[q, ORIGINAL_SHARE]
+            chances[q, MASS] = max(chances[q, MASS], chances[q, ORIGINAL_SHARE] / n_grid)
             weights += chances[q, MASS]
         for q in range(n_main):
             chances[q, MASS] *= wanted / weights
@@ -449,7 +456,7 @@ def assemble(parts: list[Found], n_outputs: int) -> Successors:
 
 def rows_at_once(n_samples: int, n_outputs: int) -> int:
     """How many rows to work on at once."""
-    return max(1, min(CHUNK, (1 << 24) // (2 * n_samples * n_outputs)))
+    return max(1, min(LARGEST_CHUNK, (1 << 24) // (2 * n_samples * n_outputs)))
 
 
 def thin(full: Successors, n_samples: int, seed: int) -> Successors:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.data import TransitionBatch, TransitionDataset
-from mbagent.models.base import BaseTransitionModel, FitReport, KnownModel
+from mbagent.models.base import BaseTransitionModel, ExactModel, FitReport
 from mbagent.models.protocol import Successors, as_keys
 from mbagent.models.systematic_sampling import thin
 from mbagent.types import Actions, Bools, Floats, Randomness, States
@@ -22,7 +22,7 @@ from mbagent_envs.jit import compiled
 from mbagent_envs.random_keys import derive, hash_rows, uniforms
 
 
-class TableModel(KnownModel):
+class TabularMDP(ExactModel):
     """A world of one factor whose rules are known. There is nothing to learn: ``fit`` does nothing, ``state_dict`` is empty.
 
     Args:
@@ -73,9 +73,9 @@ class TableModel(KnownModel):
 
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
         """See TransitionModel."""
-        pairs, luck = states[:, 0] * self.n_actions + actions, uniforms(as_keys(rng, len(states)), 1)[:, 0]
+        pairs, noise = states[:, 0] * self.n_actions + actions, uniforms(as_keys(rng, len(states)), 1)[:, 0]
         cumulated = np.concatenate([[0.0], np.cumsum(self.probabilities)])
-        target = cumulated[self.offsets[pairs]] + luck
+        target = cumulated[self.offsets[pairs]] + noise
         entries = np.clip(np.searchsorted(cumulated, target, side="right") - 1, self.offsets[pairs], self.offsets[pairs + 1] - 1)
         return self.next_states[entries, None], self.terminated[entries]
 
@@ -95,7 +95,7 @@ class TableModel(KnownModel):
         return result
 
 
-def toy_text_model(env: gym.Env[Any, Any]) -> tuple[TableModel, Callable[[Any, Any, Any], Floats]]:
+def toy_text_model(env: gym.Env[Any, Any]) -> tuple[TabularMDP, Callable[[Any, Any, Any], Floats]]:
     """The true model of a Gymnasium toy_text environment, and its reward as a function of (obs, action, next_obs).
 
     Rewards of outcomes that share (obs, action, next_obs) are averaged by their probabilities.
@@ -127,7 +127,7 @@ def toy_text_model(env: gym.Env[Any, Any]) -> tuple[TableModel, Callable[[Any, A
     rewards = expected / np.maximum(mass, 1e-300)
     following, over, probabilities = zip(*rows, strict=True)
     start = np.flatnonzero(np.asarray(unwrapped.initial_state_distrib) > 0)
-    model = TableModel(
+    model = TabularMDP(
         np.asarray(offsets),
         np.asarray(following),
         np.asarray(over),

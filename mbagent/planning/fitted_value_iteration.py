@@ -30,7 +30,7 @@ PAIRED = 0.3
 MOST_PAIRS = 10_000_000
 """Pairs in all states that are to be valued, at most; where there are more, there are no pairs."""
 
-MOST_COLUMNS = 2000
+MOST_PAIR_FEATURES = 2000
 """Columns between which there can be pairs."""
 
 
@@ -58,7 +58,7 @@ class PairRegression:
         self._x = csr_array((np.ones(len(rows)), (rows, column)), shape=(len(states), len(used)))
         self._on, self._begin = self._shown(valued)
         n_on = np.diff(self._begin)
-        self._paired = len(used) <= MOST_COLUMNS and int((n_on * (n_on - 1) // 2).sum()) <= MOST_PAIRS
+        self._paired = len(used) <= MOST_PAIR_FEATURES and int((n_on * (n_on - 1) // 2).sum()) <= MOST_PAIRS
         shared = (self._x @ self._x.T).toarray()
         kernel = shared + (PAIRED / 2.0) * shared * (shared - 1.0) if self._paired else shared
         self._typical = kernel.mean(axis=0)
@@ -93,22 +93,22 @@ def _sums(leaf: LeafValues, on: Ints, begin: Ints, out: Floats) -> None:
         out[i] = sum_of(leaf, on[begin[i] : begin[i + 1]])
 
 
-ROUNDS = 3
+ITERATIONS = 3
 """Times that play, and the fit after it, are repeated."""
 
 STATES_A_ROUND = 600
 """States taken from each round of play."""
 
-PLAYERS = 64
+EPISODES = 64
 """Episodes imagined side by side."""
 
-STEPS = 40
+EPISODE_STEPS = 40
 """Steps of each of them."""
 
-CHANCE = 0.2
+RANDOM_ACTION = 0.2
 """Share of random actions once there are values to play by."""
 
-FEWEST_SAMPLES, MOST_SAMPLES = 4, 32
+FEWEST_SAMPLES, MOST_ROW_SAMPLES = 4, 32
 """Draws for each (state, action), at least and at most."""
 
 SAMPLES_IN_ALL = 8000
@@ -120,7 +120,7 @@ SAMPLED_TOGETHER = 4
 SWEEPS = 150
 """Backups and fits in a round, at most."""
 
-SETTLED = 1e-4
+CONVERGED = 1e-4
 """They end when no value moves by more than this share of the largest reward."""
 
 _PLAY_SALT, _EXPAND_SALT, _SAMPLE_SALT = 0xF1A1, 0xF1A2, 0xF1A3
@@ -158,7 +158,7 @@ def learn_values(task: Task) -> tuple[LeafValues, States]:
         (values, ``LOWEST_KNOWN`` where all steps earn the same; states int64 [N, F] that were met, distinct).
     """
     leaf, met = LOWEST_KNOWN, np.zeros((0, len(task.model.cardinalities)), dtype=np.int64)
-    for number in range(ROUNDS):
+    for number in range(ITERATIONS):
         played = _play(task, leaf, number)
         rng = np.random.default_rng([task.seed, number])
         some = rng.choice(len(played), size=min(len(played), STATES_A_ROUND), replace=False)
@@ -170,16 +170,16 @@ def learn_values(task: Task) -> tuple[LeafValues, States]:
 def _play(task: Task, leaf: LeafValues, number: int) -> States:
     """States int64 [N, F] met by playing greedily on the values; by chance at first."""
     rng = np.random.default_rng([task.seed, number, _PLAY_SALT])
-    states, met = task.start[rng.integers(len(task.start), size=PLAYERS)], []
-    for step in range(STEPS):
+    states, met = task.start[rng.integers(len(task.start), size=EPISODES)], []
+    for step in range(EPISODE_STEPS):
         met.append(states)
-        actions = rng.integers(task.model.n_actions, size=PLAYERS)
+        actions = rng.integers(task.model.n_actions, size=EPISODES)
         if len(leaf.common):
-            by_chance = rng.random(PLAYERS) < CHANCE
-            actions = np.where(by_chance, actions, greedy_actions(task, leaf, states, number * STEPS + step))
-        keys = derive(task.seed, _SAMPLE_SALT, number * STEPS + step, np.arange(PLAYERS))
+            by_chance = rng.random(EPISODES) < RANDOM_ACTION
+            actions = np.where(by_chance, actions, greedy_actions(task, leaf, states, number * EPISODE_STEPS + step))
+        keys = derive(task.seed, _SAMPLE_SALT, number * EPISODE_STEPS + step, np.arange(EPISODES))
         after, over = task.model.sample(states, actions, keys)
-        again = task.start[rng.integers(len(task.start), size=PLAYERS)]
+        again = task.start[rng.integers(len(task.start), size=EPISODES)]
         states = np.where(over[:, None], again, after)
     return np.concatenate(met)
 
@@ -197,7 +197,7 @@ def greedy_actions(task: Task, leaf: LeafValues, states: States, step: int) -> A
 def _expanded(task: Task, graph: StateGraph, leaf: LeafValues, step: int) -> tuple[Ints, Floats, Floats, Floats, Floats]:
     """Expands all nodes of a graph; returns them, the values of what is met, room for new ones and for q, and the rewards."""
     nodes = np.arange(len(graph))
-    samples = min(max(SAMPLES_IN_ALL // len(nodes), FEWEST_SAMPLES), MOST_SAMPLES)
+    samples = min(max(SAMPLES_IN_ALL // len(nodes), FEWEST_SAMPLES), MOST_ROW_SAMPLES)
     for begin in range(0, len(nodes), SAMPLED_TOGETHER):
         graph.expand(nodes[begin : begin + SAMPLED_TOGETHER], samples, int(derive(task.seed, _EXPAND_SALT, step, begin)[0]))
     v, q = np.zeros(len(graph)), np.zeros((len(graph), task.model.n_actions))
@@ -209,12 +209,12 @@ def _fit(task: Task, states: States, leaf: LeafValues, number: int) -> LeafValue
     """Values fitted on states int64 [N, F], distinct, from the given ones on."""
     graph = StateGraph(task.model)
     graph.add(states, np.zeros(len(states), dtype=np.int64))
-    nodes, v, found, q, rewards = _expanded(task, graph, leaf, (ROUNDS + number) * STEPS)
+    nodes, v, found, q, rewards = _expanded(task, graph, leaf, (ITERATIONS + number) * EPISODE_STEPS)
     if rewards.min() == rewards.max():
         return LOWEST_KNOWN
     low, high = (float(end) / (1.0 - task.gamma) for end in (min(rewards.min(), 0.0), max(rewards.max(), 0.0)))
     regression = PairRegression(graph.states[nodes], task.model.cardinalities, graph.states, low, high)
-    moved = SETTLED * float(np.abs(rewards).max())
+    moved = CONVERGED * float(np.abs(rewards).max())
     for _ in range(SWEEPS):
         _back_up(graph.arrays, rewards, task.gamma, nodes, v, q, found)
         leaf, before = regression.fit(found), v

@@ -10,7 +10,7 @@ from mbagent.models.mdp import StateGraph
 from mbagent.models.neural.forecasts import DirectForecastModel
 from mbagent.models.protocol import TransitionModel
 from mbagent.planning.planner import Plan, PlannerSettings, best_actions
-from mbagent.planning.trajectories import Foresight
+from mbagent.planning.trajectories import PlanTrace
 from mbagent.planning.value_iteration import score_edges
 from mbagent.types import Actions, Floats, Keys, Reward, States
 from mbagent_envs.random_keys import derive, uniforms
@@ -145,8 +145,8 @@ class FlatMonteCarlo:
         rows = np.repeat(np.arange(len(roots)), n_actions * each)
         actions = np.tile(np.repeat(np.arange(n_actions), each), len(roots))
         # Simulation k meets the same luck under every action.
-        luck = derive(settings.seed, np.arange(done, done + each))
-        keys = np.tile(luck, len(roots) * n_actions)
+        noise = derive(settings.seed, np.arange(done, done + each))
+        keys = np.tile(noise, len(roots) * n_actions)
         given = (goal, roots[rows], keys, settings.horizon, settings.gamma, actions)
         if settings.forecasts == "direct":
             returns = forecast_returns(direct_model(model), *given)
@@ -154,7 +154,7 @@ class FlatMonteCarlo:
             returns = random_returns(model, *given)
         return returns.reshape(len(roots), n_actions, each)
 
-    def foresee(self, root: States) -> Foresight:
+    def trace(self, root: States) -> PlanTrace:
         """What the plan from one root [1, F] rests on; as there is no behaviour but random play, futures are one step long."""
         plan, model, goal = self.plan(root), self._model, self._goal
         assert model is not None
@@ -162,7 +162,7 @@ class FlatMonteCarlo:
         graph = StateGraph(model)
         node = graph.add(root, np.zeros(1, dtype=np.int64))
         graph.expand(node, self.settings.n_samples, self.settings.seed)
-        return Foresight(plan, graph, int(node[0]), score_edges(graph, goal), np.full(len(graph), -1, dtype=np.int64))
+        return PlanTrace(plan, graph, int(node[0]), score_edges(graph, goal), np.full(len(graph), -1, dtype=np.int64))
 
 
 def direct_model(model: TransitionModel) -> DirectForecastModel:

@@ -16,26 +16,26 @@ import numpy as np
 
 from mbagent.models.mdp import GraphArrays, StateGraph
 from mbagent.planning.lookahead import grow_lookahead
-from mbagent.planning.machine_search import BOUND_BELOW, BOUND_TOP, MOST_COUNTED
-from mbagent.planning.planners import Imagined, MachinePlanner
+from mbagent.planning.machine_search import BOUND_BELOW, BOUND_TOP, MOST_VISITS
+from mbagent.planning.planners import Expanded, ValueIterationPlanner
 from mbagent.planning.value_function import LOWEST_KNOWN
 from mbagent.planning.value_iteration import TOLERANCE, Values, bellman, break_ties, score_edges, settle, sweep
 from mbagent.types import Floats, Ints, States
 from mbagent_envs.jit import borrowed, compiled, inlined
 from mbagent_envs.random_keys import derive, derive_one, mix
 
-FIRST_SWEEPS, GROWING_SWEEPS, FINAL_SWEEPS = 10, 3, 100
+FIRST_SWEEPS, GROWING_SWEEPS, GRAPH_FINAL_SWEEPS = 10, 3, 100
 """Sweeps of value iteration, at most: before the first simulation, after each growth of the machine, after the last one."""
 
-LEAF_SAMPLES = 4
+GRAPH_LEAF_SAMPLES = 4
 """Draws for each (state, action) of a node that the search adds."""
 
 FIRST_WAVE, WAVE_SHARE = 8, 4
 """The first wave's simulations; later ones are at most one for so many that went before."""
 
-_SEARCH_SALT = 0x6EA6C4
-_STEP = np.uint64(0x9E3779B97F4A7C15)
-_UNIT = 2.0**-53
+_GRAPH_SALT = 0x6EA6C4
+_GRAPH_STEP = np.uint64(0x9E3779B97F4A7C15)
+_GRAPH_UNIT = 2.0**-53
 
 
 class Tables(NamedTuple):
@@ -89,19 +89,19 @@ class Rules(NamedTuple):
     key: np.uint64
 
 
-class GraphSearch(MachinePlanner):
+class GraphSearch(ValueIterationPlanner):
     """UCT on lookahead machines around the roots, for thousands of simulations.
 
     Every search starts from the values of a lookahead machine, each counting as ``prior_visits`` visits, and grows it where
     simulations leave it. ``wave`` bounds the simulations of a root between two calls of the model.
 
     Attributes:
-        imagined: successors drawn from the model so far, equal ones of a (state, action) counted once.
+        expanded: successors drawn from the model so far, equal ones of a (state, action) counted once.
     """
 
-    imagined = 0
+    expanded = 0
 
-    def _imagine(self, roots: States) -> Imagined:
+    def _expand(self, roots: States) -> Expanded:
         """Searches from each root [R, F]."""
         graph, settings = self._empty_graph(), self.settings
         nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
@@ -112,23 +112,23 @@ class GraphSearch(MachinePlanner):
         tables = _tables(graph, first, len(roots), min(settings.wave, n_simulations), settings.horizon)
         weigh(graph.arrays, tables, settings.gamma, 0)
         measure_spans(graph.arrays, tables)
-        key = np.uint64(derive(settings.seed, _SEARCH_SALT)[0])
+        key = np.uint64(derive(settings.seed, _GRAPH_SALT)[0])
         rules = Rules(n_simulations, settings.wave, settings.gamma, settings.c_uct, int(settings.prior_visits), key)
         done, growths = np.zeros(2, dtype=np.int64), 0
         while n := run_waves(graph.arrays, nodes, tables, rules, BOUND_TOP, BOUND_BELOW, done):
             growths += 1
-            tables = self._grown(graph, nodes, tables, n, int(derive(settings.seed, _SEARCH_SALT, growths)[0]))
+            tables = self._grown(graph, nodes, tables, n, int(derive(settings.seed, _GRAPH_SALT, growths)[0]))
         size, n_edges = len(graph), graph.n_edges
-        self.imagined += n_edges
+        self.expanded += n_edges
         solution = Values(tables.v[:size], tables.q[:size], tables.rewards[:n_edges], tables.frontier)
-        settle(graph, solution, settings.gamma, FINAL_SWEEPS)
+        settle(graph, solution, settings.gamma, GRAPH_FINAL_SWEEPS)
         scores = break_ties(graph, solution.q, nodes, settings.gamma)
-        return Imagined(graph, nodes, solution, tables.root_visits, scores)
+        return Expanded(graph, nodes, solution, tables.root_visits, scores)
 
     def _grown(self, graph: StateGraph, roots: Ints, tables: Tables, n: int, seed: int) -> Tables:
         """Expands the ``n`` leaves that a wave has met, and takes in what follows from them."""
         leaves, n_nodes, n_edges = np.sort(tables.leaves[:n]), len(graph), graph.n_edges
-        graph.expand(leaves, LEAF_SAMPLES, seed)
+        graph.expand(leaves, GRAPH_LEAF_SAMPLES, seed)
         tables = _lengthened(tables, len(graph.arrays.tags), len(graph.arrays.sources))
         tables.rewards[n_edges : graph.n_edges] = score_edges(graph, self._known_goal(), n_edges)
         weigh(graph.arrays, tables, self.settings.gamma, n_edges)
@@ -205,7 +205,7 @@ def take_in(graph: GraphArrays, tables: Tables, gamma: float, leaves: Ints, n_be
 
 @inlined
 def _descend(
-    r: int, w: int, root: int, luck: np.uint64, scale: float, prior: int, graph: GraphArrays, top: Floats, below: Floats,
+    r: int, w: int, root: int, noise: np.uint64, scale: float, prior: int, graph: GraphArrays, top: Floats, below: Floats,
     q: Floats, n: Ints, met: Ints, path: Ints,
 ) -> tuple[int, int, np.uint64]:  # fmt: skip
     """Simulation w from root r, down to its end; returns its length, the unexpanded node it met or -1, and the luck's state."""
@@ -213,11 +213,11 @@ def _descend(
     following, terminated, expanded, n_actions = graph.next_nodes, graph.terminated, graph.expanded, q.shape[1]
     s, length, leaf = root, 0, -1
     while length < path.shape[2]:
-        luck += _STEP
-        word, factor = mix(luck), scale * top[min(met[s] + prior * n_actions, MOST_COUNTED - 1)]
+        noise += _GRAPH_STEP
+        word, factor = mix(noise), scale * top[min(met[s] + prior * n_actions, MOST_VISITS - 1)]
         best, a = -np.inf, 0
         for b in range(n_actions):
-            score = q[s, b] + factor * below[min(n[s, b] + prior, MOST_COUNTED - 1)]
+            score = q[s, b] + factor * below[min(n[s, b] + prior, MOST_VISITS - 1)]
             # Ties are broken by luck: in a fixed order, simulations may go round the same few states for ever.
             if score > best or (score == best and (word >> np.uint64(b % 11)) & np.uint64(1)):
                 best, a = score, b
@@ -225,7 +225,7 @@ def _descend(
         met[s] += 1
         path[r, w, length, 0], path[r, w, length, 1] = s, a
         length += 1
-        u, e = float(word >> np.uint64(11)) * _UNIT, first[s, a]
+        u, e = float(word >> np.uint64(11)) * _GRAPH_UNIT, first[s, a]
         last = e + counts[s, a] - 1
         while e < last and u >= probabilities[e]:
             u -= probabilities[e]
@@ -236,7 +236,7 @@ def _descend(
         if not expanded[s]:
             leaf = s
             break
-    return length, leaf, luck
+    return length, leaf, noise
 
 
 @inlined
@@ -263,9 +263,11 @@ def _run_wave(graph: GraphArrays, roots: Ints, t: Tables, rules: Rules, top: Flo
     q, n, met, path, lengths, leaves, n_leaves = t.q, t.n, t.met, t.path, t.lengths, t.leaves, 0
     for r in range(len(roots)):
         root, scale = roots[r], rules.c_uct * t.spans[r]
-        luck = derive_one(rules.key, np.uint64(done))  # the same for every root
+        noise = derive_one(rules.key, np.uint64(done))  # the same for every root
         for w in range(wave):
-            lengths[r, w], leaf, luck = _descend(r, w, root, luck, scale, rules.prior_visits, graph, top, below, q, n, met, path)
+            lengths[r, w], leaf, noise = _descend(
+                r, w, root, noise, scale, rules.prior_visits, graph, top, below, q, n, met, path
+            )
             t.root_visits[r, path[r, w, 0, 1]] += 1.0
             if leaf >= 0 and met[leaf] == 0:
                 met[leaf] = 1  # until it is expanded: listed

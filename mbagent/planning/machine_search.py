@@ -19,7 +19,7 @@ from mbagent_envs.random_keys import derive_one, mix
 DEPTH = 3
 """Steps of a simulation, at most, where nothing else is said."""
 
-MOST_COUNTED = 1 << 14
+MOST_VISITS = 1 << 14
 """Visits beyond this count as so many in the bounds."""
 
 _STEP = np.uint64(0x9E3779B97F4A7C15)
@@ -92,7 +92,7 @@ def known_machine(
     return KnownMachine(first, following, total - before[pair], weight, income.reshape(-1, n_actions), first_value, over)
 
 
-_N = np.arange(MOST_COUNTED, dtype=np.float64)
+_N = np.arange(MOST_VISITS, dtype=np.float64)
 BOUND_TOP, BOUND_BELOW = np.sqrt(np.log(_N + 1.0)), 1.0 / np.sqrt(np.maximum(_N, 0.5))
 """Parts of the upper confidence bound, by total visits and by an action's."""
 
@@ -187,7 +187,7 @@ def _best_bound(s: int, scale: float, below: Floats, q: Floats, n: Ints) -> int:
     """The action with the greatest upper confidence bound."""
     best, chosen = -np.inf, 0
     for a in range(q.shape[1]):
-        score = q[s, a] + scale * below[min(n[s, a], MOST_COUNTED - 1)]
+        score = q[s, a] + scale * below[min(n[s, a], MOST_VISITS - 1)]
         if score > best:
             best, chosen = score, a
     return chosen
@@ -228,16 +228,16 @@ def _simulate(
         low, high = min(low, q[root, a]), max(high, q[root, a])
     spread, s, length = c_uct * (high - low if high > low else 1.0), root, 0
     while length < depth:
-        chosen = _best_bound(s, spread * top[min(met[s], MOST_COUNTED - 1)], below, q, n)
+        chosen = _best_bound(s, spread * top[min(met[s], MOST_VISITS - 1)], below, q, n)
         n[s, chosen] += 1
         met[s] += 1
         pair = s * n_actions + chosen
         path[length] = pair
         length += 1
         state += _STEP
-        luck, e = float(mix(state) >> np.uint64(11)) * _UNIT, first[pair]
+        noise, e = float(mix(state) >> np.uint64(11)) * _UNIT, first[pair]
         last = first[pair + 1] - 1
-        while e < last and luck >= m.below[e]:
+        while e < last and noise >= m.below[e]:
             e += 1
         if m.over[e]:
             break

@@ -137,7 +137,7 @@ class Plan:
 class Planner(Protocol):
     """Chooses actions by imagining with a model; the outcome is a pure function of (settings, model, goal, root).
 
-    One that can also show what a plan rests on has the method of ``foresight.ForeseeingPlanner``.
+    One that can also show what a plan rests on has the method of ``trace.TracingPlanner``.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:

@@ -21,22 +21,22 @@ from mbagent.planning.fitted_value_iteration import Task, learn_values
 from mbagent.planning.flat_monte_carlo import random_returns
 from mbagent.planning.lookahead import grow_lookahead
 from mbagent.planning.planner import Plan, PlannerSettings, best_actions
-from mbagent.planning.racing import Way, best_way
-from mbagent.planning.search import MAX_KEPT, Paths, Rules, Tables, begin_wave, carry_over, empty_paths, end_wave, measure_spans
-from mbagent.planning.trajectories import Foresight, best_behaviour
+from mbagent.planning.racing import LookaheadConfig, best_config
+from mbagent.planning.search import MAX_KEPT, Paths, Rules, Tables, begin_batch, carry_over, empty_paths, end_batch, measure_spans
+from mbagent.planning.trajectories import PlanTrace, best_policy
 from mbagent.planning.value_function import LOWEST_KNOWN
-from mbagent.planning.value_iteration import Machine, Values, break_ties, doubt, score_edges, settle, solve, undecided
+from mbagent.planning.value_iteration import SolvedMdp, Values, break_ties, doubt, score_edges, settle, solve, undecided
 from mbagent.types import Actions, Floats, Ints, Reward, States
 from mbagent_envs.random_keys import derive
 
-REHEARSED: dict[str, Any] = {"time_budget": None, "reuse_tree": False}
+RACED: dict[str, Any] = {"time_budget": None, "reuse_tree": False}
 """Settings while ways to look ahead are compared: the outcome must hang on neither the clock nor the order."""
 
 ROOTS_AT_ONCE = 16
 """Roots that are imagined around together; bounds the memory."""
 
 
-class Imagined(NamedTuple):
+class Expanded(NamedTuple):
     """What was imagined around R roots, and what follows from it.
 
     Attributes:
@@ -56,7 +56,7 @@ class Imagined(NamedTuple):
     tried: Floats | None = None
 
 
-class MachinePlanner:
+class ValueIterationPlanner:
     """Acts greedily on the values of the reachable machine.
 
     Where the machine reachable from the start states has at most ``max_states`` states it is generated once for the
@@ -69,51 +69,51 @@ class MachinePlanner:
         self._model: TransitionModel | None = None
         self._goal: Reward | None = None
         self._start: States | None = None
-        self._machine: Machine | None = None
-        self._imagined: StateGraph | None = None
-        self._way: Way | None = None
-        self._told = False
+        self._mdp: SolvedMdp | None = None
+        self._expanded: StateGraph | None = None
+        self._config: LookaheadConfig | None = None
+        self._described = False
 
     def set_model(self, model: TransitionModel, start_states: States) -> None:
         """See Planner. The machine is generated at the next ``plan``."""
-        self._model, self._start, self._machine, self._imagined, self._way = model, start_states, None, None, None
+        self._model, self._start, self._mdp, self._expanded, self._config = model, start_states, None, None, None
 
     def set_goal(self, goal: Reward) -> None:
         """See Planner. The machine stays, its values go."""
-        if self._machine is not None:
-            self._machine.values = None  # before the goal changes: an interrupt must not leave values of another one
-        self._goal, self._way, self._told = goal, None, False
+        if self._mdp is not None:
+            self._mdp.values = None  # before the goal changes: an interrupt must not leave values of another one
+        self._goal, self._config, self._described = goal, None, False
 
-    def look_ahead_as(self, other: MachinePlanner) -> None:
+    def share_config(self, other: ValueIterationPlanner) -> None:
         """Takes over how another planner of the same model and goal looks ahead, if that has found out."""
-        self._way = other._way
+        self._config = other._config
 
     def plan(self, roots: States) -> Plan:
         """See Planner."""
-        machine = self._solved_machine()
-        nodes = machine.find(roots)
+        mdp = self._solved_mdp()
+        nodes = mdp.find(roots)
         n_actions = self._known_model().n_actions
         values, visits = np.zeros((len(roots), n_actions)), np.zeros((len(roots), n_actions))
         scores, known = np.zeros((len(roots), n_actions)), np.flatnonzero(nodes >= 0)
-        if len(known) and machine.graph is not None and machine.values is not None:
-            values[known] = machine.values.q[nodes[known]]
-            scores[known] = break_ties(machine.graph, machine.values.q, nodes[known], self.settings.gamma)
-            self._tell_doubt(machine.bounds, nodes[known], scores[known], values[known])
+        if len(known) and mdp.graph is not None and mdp.values is not None:
+            values[known] = mdp.values.q[nodes[known]]
+            scores[known] = break_ties(mdp.graph, mdp.values.q, nodes[known], self.settings.gamma)
+            self._warn_of_doubt(mdp.bounds, nodes[known], scores[known], values[known])
         unknown = np.flatnonzero(nodes < 0)
         for begin in range(0, len(unknown), ROOTS_AT_ONCE):
             some = unknown[begin : begin + ROOTS_AT_ONCE]
-            found = self._imagine(roots[some])
+            found = self._expand(roots[some])
             values[some], visits[some], scores[some] = found.solution.q[found.nodes], found.visits, found.scores
-            if not self._told:
+            if not self._described:
                 bounds = doubt(found.graph, found.solution, self.settings.gamma)
-                self._tell_doubt(bounds, found.nodes, scores[some], values[some])
+                self._warn_of_doubt(bounds, found.nodes, scores[some], values[some])
         return Plan(best_actions(scores), values, visits)
 
-    def _tell_doubt(self, bounds: Floats | None, nodes: Ints, scores: Floats, values: Floats) -> None:
+    def _warn_of_doubt(self, bounds: Floats | None, nodes: Ints, scores: Floats, values: Floats) -> None:
         """Warns, once for each goal, where rare outcomes that have no part in a plan could change it."""
-        if self._told or bounds is None or not undecided(scores, values, bounds[nodes]).any():
+        if self._described or bounds is None or not undecided(scores, values, bounds[nodes]).any():
             return
-        self._told, settings = True, self.settings
+        self._described, settings = True, self.settings
         warnings.warn(
             f"More outcomes are rare than plans have room for, so that others stand for some of them; values may be off by up to "
             f"{bounds[nodes].max():.3g}, which could change the choice of an action: raise n_samples (now {settings.n_samples}) "
@@ -121,81 +121,81 @@ class MachinePlanner:
             stacklevel=2,
         )
 
-    def foresee(self, root: States) -> Foresight:
-        """What the plan from one root [1, F] rests on; see Foresight."""
-        machine = self._solved_machine()
-        nodes = machine.find(root)
-        if nodes[0] < 0 or machine.graph is None or machine.values is None:
-            return self._foresight(self._imagine(root), 0)
-        graph, solution = machine.graph, machine.values
+    def trace(self, root: States) -> PlanTrace:
+        """What the plan from one root [1, F] rests on; see PlanTrace."""
+        mdp = self._solved_mdp()
+        nodes = mdp.find(root)
+        if nodes[0] < 0 or mdp.graph is None or mdp.values is None:
+            return self._trace_of(self._expand(root), 0)
+        graph, solution = mdp.graph, mdp.values
         scores = break_ties(graph, solution.q, nodes, self.settings.gamma)
         nothing = np.zeros((1, graph.model.n_actions))
-        return self._foresight(Imagined(graph, nodes, solution, nothing, scores), int(graph.expanded.sum()))
+        return self._trace_of(Expanded(graph, nodes, solution, nothing, scores), int(graph.expanded.sum()))
 
-    def _foresight(self, found: Imagined, machine_states: int) -> Foresight:
+    def _trace_of(self, found: Expanded, machine_states: int) -> PlanTrace:
         plan = Plan(best_actions(found.scores), found.solution.q[found.nodes], found.visits)
-        behaviour = best_behaviour(found.graph, found.solution.q, self.settings.gamma, found.tried)
+        policy = best_policy(found.graph, found.solution.q, self.settings.gamma, found.tried)
         solution = found.solution
-        return Foresight(plan, found.graph, int(found.nodes[0]), solution.rewards, behaviour, solution.v, machine_states)
+        return PlanTrace(plan, found.graph, int(found.nodes[0]), solution.rewards, policy, solution.v, machine_states)
 
-    def _imagine(self, roots: States) -> Imagined:
+    def _expand(self, roots: States) -> Expanded:
         """Imagines around each root [R, F]; here a lookahead machine, solved, without a search."""
         graph, solution, nodes = self._lookahead(roots)
         scores = break_ties(graph, solution.q, nodes, self.settings.gamma)
-        return Imagined(graph, nodes, solution, np.zeros_like(scores), scores)
+        return Expanded(graph, nodes, solution, np.zeros_like(scores), scores)
 
     def _empty_graph(self) -> StateGraph:
         """A graph for the next roots; what the last one held is gone."""
-        if self._imagined is None:
-            self._imagined = StateGraph(self._known_model())
-        self._imagined.clear()
-        return self._imagined
+        if self._expanded is None:
+            self._expanded = StateGraph(self._known_model())
+        self._expanded.clear()
+        return self._expanded
 
     def _lookahead(self, roots: States) -> tuple[StateGraph, Values, Ints]:
         """A machine around each root [R, F], solved; root r is in group r. Returns (graph, values, root nodes)."""
-        way, graph, settings = self._chosen_way(), self._empty_graph(), self.settings
+        config, graph, settings = self._chosen_config(), self._empty_graph(), self.settings
         nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
-        grow_lookahead(graph, nodes, way.states, way.samples, settings.horizon, settings.seed)
-        return graph, solve(graph, self._known_goal(), settings.gamma, len(roots), way.leaf), nodes
+        grow_lookahead(graph, nodes, config.states, config.samples, settings.horizon, settings.seed)
+        return graph, solve(graph, self._known_goal(), settings.gamma, len(roots), config.leaf), nodes
 
-    def _chosen_way(self) -> Way:
+    def _chosen_config(self) -> LookaheadConfig:
         """How to look ahead under this goal: as the settings say, with learned values at the edge or instead, if any."""
-        if self._way is None:
+        if self._config is None:
             settings, start = self.settings, self._start
-            usual = Way(LOWEST_KNOWN, settings.lookahead_states, settings.lookahead_samples)
+            usual = LookaheadConfig(LOWEST_KNOWN, settings.lookahead_states, settings.lookahead_samples)
             if settings.learn_values and start is not None and len(start):
-                usual = self._rehearse(usual, Task(self._known_model(), self._known_goal(), start, settings.gamma, settings.seed))
-            self._way = usual
-        return self._way
+                usual = self._race(usual, Task(self._known_model(), self._known_goal(), start, settings.gamma, settings.seed))
+            self._config = usual
+        return self._config
 
-    def _rehearse(self, usual: Way, task: Task) -> Way:
+    def _race(self, usual: LookaheadConfig, task: Task) -> LookaheadConfig:
         """Learns values for the goal, and finds out whether plans are best with them at the edge, without or only with them."""
         settings = self.settings
         leaf, met = learn_values(task)
         if len(leaf.common) == 0:
             return usual
 
-        def act(way: Way, states: States) -> Actions:
-            self._way = way
-            return best_actions(self._imagine(states).scores)
+        def act(config: LookaheadConfig, states: States) -> Actions:
+            self._config = config
+            return best_actions(self._expand(states).scores)
 
         try:
-            self.settings = replace(settings, **REHEARSED)
-            ways = (usual._replace(leaf=leaf), usual, Way(leaf, 1, settings.n_samples))
-            return best_way(replace(task, start=met), ways, act)
+            self.settings = replace(settings, **RACED)
+            configs = (usual._replace(leaf=leaf), usual, LookaheadConfig(leaf, 1, settings.n_samples))
+            return best_config(replace(task, start=met), configs, act)
         finally:  # should the goal fail now, it is tried again
-            self.settings, self._way = settings, None
+            self.settings, self._config = settings, None
 
-    def _solved_machine(self) -> Machine:
-        if self._machine is None:
+    def _solved_mdp(self) -> SolvedMdp:
+        if self._mdp is None:
             assert self._start is not None or self._model is None
             model, start, settings = self._known_model(), self._start, self.settings
             if start is None:
                 raise RuntimeError("The planner has no start states; call set_model first.")
-            self._machine = Machine(model, start, settings.max_states, settings.n_samples, settings.seed)
-        if self._machine.values is None:
-            self._machine.set_goal(self._known_goal(), self.settings.gamma)
-        return self._machine
+            self._mdp = SolvedMdp(model, start, settings.max_states, settings.n_samples, settings.seed)
+        if self._mdp.values is None:
+            self._mdp.set_goal(self._known_goal(), self.settings.gamma)
+        return self._mdp
 
     def _known_model(self) -> TransitionModel:
         if self._model is None:
@@ -220,10 +220,10 @@ MAX_SEARCHED = 100_000
 _SEARCH_SALT, _CARRIED_SALT = 0x5EA6C4, 0xCA1212
 
 
-class MctsPlanner(MachinePlanner):
+class MctsPlanner(ValueIterationPlanner):
     """UCT on a graph of imagined states.
 
-    With ``leaf_values="machine"`` the search starts from the values of a lookahead machine around the root, each counting as
+    With ``leaf_values="mdp"`` the search starts from the values of a lookahead machine around the root, each counting as
     ``prior_visits`` visits, and goes on growing it where it looks promising; where the whole reachable machine is known and
     solved there is nothing to search for.
     With ``leaf_values="rollouts"`` it starts from nothing and values leaves by random play, as textbook UCT does.
@@ -257,14 +257,14 @@ class MctsPlanner(MachinePlanner):
             self._last = None
         if self.settings.leaf_values == "machine":
             return super().plan(roots)
-        found = self._imagine(roots)
+        found = self._expand(roots)
         return Plan(best_actions(found.scores), found.solution.q[found.nodes], found.visits)
 
-    def foresee(self, root: States) -> Foresight:
-        """See MachinePlanner."""
-        return super().foresee(root) if self.settings.leaf_values == "machine" else self._foresight(self._imagine(root), 0)
+    def trace(self, root: States) -> PlanTrace:
+        """See ValueIterationPlanner."""
+        return super().trace(root) if self.settings.leaf_values == "machine" else self._trace_of(self._expand(root), 0)
 
-    def _imagine(self, roots: States) -> Imagined:
+    def _expand(self, roots: States) -> Expanded:
         """Searches from each root [R, F]."""
         settings = self.settings
         deadline = None if settings.time_budget is None else time.perf_counter() + len(roots) * settings.time_budget
@@ -288,9 +288,9 @@ class MctsPlanner(MachinePlanner):
             return None
         graph = self._spare = self._spare if self._spare is not None else StateGraph(self._known_model())
         tables = carry_over(last.graph, last.tables, root, graph)
-        if self.settings.leaf_values == "machine" and 2 * graph.expanded.sum() < self._chosen_way().states:
+        if self.settings.leaf_values == "machine" and 2 * graph.expanded.sum() < self._chosen_config().states:
             return None
-        self._imagined, self._spare = graph, last.graph
+        self._expanded, self._spare = graph, last.graph
         return _Search(self, graph, tables, np.zeros(1, dtype=np.int64), last.decision + 1)
 
     def _bare_roots(self, roots: States) -> tuple[StateGraph, Values, Ints]:
@@ -317,7 +317,7 @@ class _Search:
         if not (rollouts and decision):
             measure_spans(graph.arrays, roots, self.tables)
 
-    def run(self, deadline: float | None = None) -> Imagined:
+    def run(self, deadline: float | None = None) -> Expanded:
         """Runs all simulations, or those that there is time for; ``deadline`` is a value of ``time.perf_counter``."""
         if deadline is not None:
             return self._run_until(deadline)
@@ -328,11 +328,11 @@ class _Search:
             if settings.num_simulations - done < wave:
                 wave = settings.num_simulations - done
                 paths = empty_paths(len(self.roots), wave, settings.horizon)
-            self._wave(paths, leaves, done)
+            self._run_batch(paths, leaves, done)
             done += wave
         return self._result()
 
-    def _run_until(self, deadline: float) -> Imagined:
+    def _run_until(self, deadline: float) -> Expanded:
         """Runs waves, one at least, until another one and what comes after the last would not be done in time."""
         wave, done, now = self.settings.wave, 0, time.perf_counter()
         paths = empty_paths(len(self.roots), wave, self.settings.horizon)
@@ -340,26 +340,26 @@ class _Search:
         last = 0.0
         while done == 0 or (now + last + self.planner.settling * len(self.graph) < deadline and len(self.graph) < MAX_SEARCHED):
             began = now
-            self._wave(paths, leaves, done)
+            self._run_batch(paths, leaves, done)
             done, now = done + wave, time.perf_counter()
             last = now - began
         found = self._result()
         self.planner.settling = (time.perf_counter() - now) / len(self.graph)
         return found
 
-    def _result(self) -> Imagined:
+    def _result(self) -> Expanded:
         graph, roots, t = self.graph, self.roots, self.tables
         n, m, visits = len(graph), graph.n_edges, self.tables.root_visits
         solution = Values(t.v[:n], t.q[:n], t.rewards[:m], t.frontier, t.leaf)
         if self.settings.backup == "mean":
-            return Imagined(graph, roots, solution, visits, visits + 1e-6 * _unit(t.q[roots]), t.visits[:n])
+            return Expanded(graph, roots, solution, visits, visits + 1e-6 * _unit(t.q[roots]), t.visits[:n])
         settle(graph, solution, self.settings.gamma, FINAL_SWEEPS)
-        return Imagined(graph, roots, solution, visits, break_ties(graph, solution.q, roots, self.settings.gamma))
+        return Expanded(graph, roots, solution, visits, break_ties(graph, solution.q, roots, self.settings.gamma))
 
-    def _wave(self, paths: Paths, leaves: Ints, done: int) -> None:
+    def _run_batch(self, paths: Paths, leaves: Ints, done: int) -> None:
         """A wave of simulations: one call of the model, one of the goal."""
         graph, rules = self.graph, self.rules
-        n, n_widened = begin_wave(graph.arrays, self.roots, self.tables, rules, done, paths, leaves)
+        n, n_widened = begin_batch(graph.arrays, self.roots, self.tables, rules, done, paths, leaves)
         n_nodes, n_edges, first = len(graph), graph.n_edges, paths.leaves.size
         draws = self.settings.n_samples if rules.rollouts else LEAF_SAMPLES
         graph.expand(leaves[:n], draws, int(_key(self.settings.seed, done + 1)))
@@ -367,7 +367,7 @@ class _Search:
         self.tables.rewards[n_edges : graph.n_edges] = score_edges(graph, self.planner._known_goal(), n_edges)
         ends = self._rollouts(paths, done) if rules.rollouts else np.empty(paths.ends.shape)
         widened = leaves[first : first + n_widened]
-        end_wave(graph.arrays, self.roots, self.tables, rules, n_nodes, leaves[:n], widened, paths, ends)
+        end_batch(graph.arrays, self.roots, self.tables, rules, n_nodes, leaves[:n], widened, paths, ends)
 
     def _make_room(self) -> None:
         """Lengthens the tables to the graph's length."""

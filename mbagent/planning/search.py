@@ -89,11 +89,11 @@ def select(
                     break
                 chosen = choose(node, q, visits, prior_visits, c_uct * spans[r])
                 visits[node, chosen] += 1.0
-                luck = uniform_at(key, (first_simulation + w) * horizon + length)
+                noise = uniform_at(key, (first_simulation + w) * horizon + length)
                 edge = graph.first[node, chosen]
                 last = edge + graph.counts[node, chosen] - 1
-                while edge < last and luck >= graph.probabilities[edge]:
-                    luck -= graph.probabilities[edge]
+                while edge < last and noise >= graph.probabilities[edge]:
+                    noise -= graph.probabilities[edge]
                     edge += 1
                 edges[r, w, length] = edge
                 length += 1
@@ -211,7 +211,7 @@ class Rules(NamedTuple):
 
 
 @compiled
-def begin_wave(
+def begin_batch(
     graph: GraphArrays, roots: Ints, tables: Tables, rules: Rules, done: int, paths: Paths, leaves: Ints
 ) -> tuple[int, int]:
     """Runs a wave of simulations down to leaves, after ``done`` others, and writes the nodes to expand to ``leaves`` [2 R W].
@@ -271,7 +271,7 @@ def _widen(graph: GraphArrays, roots: Ints, paths: Paths, out: Ints) -> int:
 
 
 @compiled
-def end_wave(
+def end_batch(
     graph: GraphArrays,
     roots: Ints,
     tables: Tables,

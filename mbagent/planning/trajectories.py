@@ -19,7 +19,7 @@ _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
-class Foresight:
+class PlanTrace:
     """What the plan from one root rests on.
 
     Attributes:
@@ -27,7 +27,7 @@ class Foresight:
         graph: what was imagined; good until the planner plans again.
         root: the root's node.
         rewards: float64 [M], of the graph's successor edges.
-        behaviour: int64 [N], the action that the best behaviour found takes in each node; -1 where imagination ends.
+        policy: int64 [N], the action that the best behaviour found takes in each node; -1 where imagination ends.
         values: float64 [N], of the graph's states; None with flat Monte Carlo.
         machine_states: number of states if the whole reachable machine was solved, so that nothing was searched; else 0.
     """
@@ -36,21 +36,21 @@ class Foresight:
     graph: StateGraph
     root: int
     rewards: Floats
-    behaviour: Ints
+    policy: Ints
     values: Floats | None = None
     machine_states: int = 0
 
 
 @runtime_checkable
-class ForeseeingPlanner(Protocol):
+class TracingPlanner(Protocol):
     """A planner that can show what its plan rests on."""
 
-    def foresee(self, root: States) -> Foresight:
+    def trace(self, root: States) -> PlanTrace:
         """What the plan from one root int64 [1, F] rests on; its plan is that of ``plan(root)``."""
         ...
 
 
-def best_behaviour(graph: StateGraph, q: Floats, gamma: float, tried: Floats | None = None) -> Ints:
+def best_policy(graph: StateGraph, q: Floats, gamma: float, tried: Floats | None = None) -> Ints:
     """The action [N] that each node's best behaviour takes, chosen as at the root; -1 for nodes without successors.
 
     Args:
@@ -59,40 +59,40 @@ def best_behaviour(graph: StateGraph, q: Floats, gamma: float, tried: Floats | N
         gamma: discount.
         tried: [N, A], simulations where they decide; nodes without any count as unknown.
     """
-    behaviour = np.full(len(graph), -1, dtype=np.int64)
+    policy = np.full(len(graph), -1, dtype=np.int64)
     known = np.flatnonzero(graph.expanded if tried is None else tried.sum(axis=1) > 0.0)
     if len(known):
-        behaviour[known] = best_actions(break_ties(graph, q, known, gamma) if tried is None else tried[known])
-    return behaviour
+        policy[known] = best_actions(break_ties(graph, q, known, gamma) if tried is None else tried[known])
+    return policy
 
 
-def likeliest_futures(foresight: Foresight, n_futures: int, n_steps: int) -> list[list[list[int]]]:
+def likeliest_trajectories(trace: PlanTrace, n_futures: int, n_steps: int) -> list[list[list[int]]]:
     """For every action of the root the likeliest sequences of successor edges, the likeliest first.
 
-    After the first action they follow ``foresight.behaviour``. A sequence ends after ``n_steps`` edges, with the episode,
+    After the first action they follow ``trace.policy``. A sequence ends after ``n_steps`` edges, with the episode,
     or where imagination ends. The list is exact: sequences are looked for best first, each judged by its own probability
     times that of its likeliest continuation, which dynamic programming gives.
     """
-    chances = _continuation_chances(foresight, n_steps)
-    n_actions = foresight.graph.model.n_actions
-    return [list(islice(_in_order(foresight, action, chances), n_futures)) for action in range(n_actions)]
+    chances = _continuation_chances(trace, n_steps)
+    n_actions = trace.graph.model.n_actions
+    return [list(islice(_in_order(trace, action, chances), n_futures)) for action in range(n_actions)]
 
 
-def _continuation_chances(foresight: Foresight, n_steps: int) -> list[Floats]:
+def _continuation_chances(trace: PlanTrace, n_steps: int) -> list[Floats]:
     """Entry k: probability [N] of each node's likeliest sequence of at most k more edges."""
-    graph = foresight.graph
-    followed = np.flatnonzero(graph.actions == foresight.behaviour[graph.sources])
+    graph = trace.graph
+    followed = np.flatnonzero(graph.actions == trace.policy[graph.sources])
     sources, targets, p = graph.sources[followed], graph.next_nodes[followed], graph.probabilities[followed]
     chances = [np.ones(len(graph))]
     for _ in range(n_steps - 1):
-        here = np.where(foresight.behaviour >= 0, 0.0, 1.0)
+        here = np.where(trace.policy >= 0, 0.0, 1.0)
         np.maximum.at(here, sources, p * np.where(graph.terminated[followed], 1.0, chances[-1][targets]))
         chances.append(here)
     return chances
 
 
-def _in_order(foresight: Foresight, action: int, chances: list[Floats]) -> Iterator[list[int]]:
-    graph, behaviour, n_steps = foresight.graph, foresight.behaviour, len(chances)
+def _in_order(trace: PlanTrace, action: int, chances: list[Floats]) -> Iterator[list[int]]:
+    graph, policy, n_steps = trace.graph, trace.policy, len(chances)
     waiting: list[tuple[float, list[int], float]] = []
 
     def begin(path: list[int], probability: float, bound: float, node: int, chosen: int) -> None:
@@ -106,11 +106,11 @@ def _in_order(foresight: Foresight, action: int, chances: list[Floats]) -> Itera
                 # Equal but for rounding must be equal: else no path of many alike would be followed to its end.
                 heapq.heappush(waiting, (-(bound if best >= bound * (1.0 - _ROUNDING) else best), [*path, int(edge)], here))
 
-    begin([], 1.0, 1.0, foresight.root, action)
+    begin([], 1.0, 1.0, trace.root, action)
     while waiting:
         negative, path, probability = heapq.heappop(waiting)
         node = graph.next_nodes[path[-1]]
-        if len(path) == n_steps or graph.terminated[path[-1]] or behaviour[node] < 0:
+        if len(path) == n_steps or graph.terminated[path[-1]] or policy[node] < 0:
             yield path
         else:
-            begin(path, probability, -negative, node, behaviour[node])
+            begin(path, probability, -negative, node, policy[node])

@@ -43,7 +43,7 @@ LOWEST_KNOWN = LeafValues(_NOTHING, _NOTHING, _NOTHING, 0.0, np.zeros(0), np.zer
 
 
 @compiled
-def columns_on(leaf: LeafValues, state: Ints, on: Ints) -> int:
+def features_on(leaf: LeafValues, state: Ints, on: Ints) -> int:
     """Writes the columns that a state [F] has on to ``on`` [F]; returns how many."""
     n = 0
     for f in range(len(state)):
@@ -71,7 +71,7 @@ def sum_of(leaf: LeafValues, on: Ints) -> float:
 def leaf_value(leaf: LeafValues, state: Ints) -> float:
     """What an unexpanded state [F] is worth; something must have been learned."""
     on = np.empty(len(state), dtype=np.int64)
-    return sum_of(leaf, on[: columns_on(leaf, state, on)])
+    return sum_of(leaf, on[: features_on(leaf, state, on)])
 
 
 @compiled

@@ -19,7 +19,7 @@ TOLERANCE = 1e-7
 
 MAX_SWEEPS = 5000
 
-TIE = 1e-6
+VALUE_TIE = 1e-6
 """Values closer than this share of the greatest of them are equal: sweeps stop about there."""
 
 MAX_NEWS_SWEEPS = 200
@@ -177,12 +177,12 @@ def break_ties(graph: StateGraph, q: Floats, roots: Ints, gamma: float) -> Float
     """
     scores = q[roots].copy()
     top = scores.max(axis=1, keepdims=True)
-    slack = TIE * np.maximum(np.abs(scores).max(axis=1, keepdims=True), 1e-12)
+    slack = VALUE_TIE * np.maximum(np.abs(scores).max(axis=1, keepdims=True), 1e-12)
     tied = scores >= top - slack
     if (tied.sum(axis=1) < 2).all() or graph.expanded[graph.next_nodes[~graph.terminated]].all():
         return scores
     news = np.zeros_like(q)
-    _lead_to_news(graph.arrays, q, TIE, gamma, MAX_NEWS_SWEEPS, news)
+    _lead_to_news(graph.arrays, q, VALUE_TIE, gamma, MAX_NEWS_SWEEPS, news)
     found = news[roots]
     scores[tied] = (top + slack * (1.0 + found))[tied]
     return scores
@@ -265,11 +265,11 @@ def undecided(scores: Floats, q: Floats, bounds: Floats) -> Bools:
     return np.asarray((rivals & (bounds > 0.0)).any(axis=1), dtype=np.bool_)
 
 
-DRAWS, MOST_SAMPLES = 4_000_000, 256
+DRAWS, MOST_SMALL_SAMPLES = 4_000_000, 256
 """Draws of a machine in which there is luck, and of each (state, action) pair, at most: a small machine affords more."""
 
 
-class Machine:
+class SolvedMdp:
     """The finite-state machine reachable from the known start states, solved anew for each goal.
 
     Args:
@@ -312,7 +312,7 @@ class Machine:
 
 def _affordable(graph: StateGraph, n_samples: int) -> int:
     """How many draws for each (state, action) a machine of this size may cost, where there is any luck."""
-    if n_samples >= MOST_SAMPLES or graph.counts.max(initial=0) <= 1:
+    if n_samples >= MOST_SMALL_SAMPLES or graph.counts.max(initial=0) <= 1:
         return n_samples
     each = DRAWS // max(graph.counts.size, 1)
-    return max(n_samples, min(MOST_SAMPLES, 1 << max(each, 1).bit_length() - 1))
+    return max(n_samples, min(MOST_SMALL_SAMPLES, 1 << max(each, 1).bit_length() - 1))

@@ -18,7 +18,7 @@ from mbagent.exploration.strategies import (
     RandomExploration,
     Watching,
 )
-from mbagent.exploration.visit_counts import START, VisitTable
+from mbagent.exploration.visit_counts import START_NODE, VisitTable
 from mbagent.types import Ints
 
 pytestmark = pytest.mark.filterwarnings("ignore:The environment has no reward_fn")
@@ -166,7 +166,7 @@ def test_lights_that_flicker_do_not_hide_where_to_go(copies: int, tmp_path: Any)
 
 
 def test_after_so_many_values_no_more_are_kept_and_what_was_found_holds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mbagent.exploration.MANY_VALUES", 20_000)
+    monkeypatch.setattr("mbagent.exploration.strategies.MANY_VALUES", 20_000)
     explorer, rng, right = EXPLORATIONS["auto"](2), np.random.default_rng(0), np.random.default_rng(1).integers(2, size=20)
     assert isinstance(explorer, DirectedExploration)
     state, tried = np.zeros((1, 11), dtype=np.int64), set()
@@ -193,10 +193,10 @@ def test_outcomes_are_counted_apart_as_the_table_grows() -> None:
     states, actions, after = rng.integers(300, size=5000), rng.integers(2, size=5000), rng.integers(5, size=5000)
     for part in np.array_split(np.arange(5000), 50):
         nodes, targets = table.add(states[part, None]), table.add(after[part, None])
-        table.record(nodes, actions[part], np.where(after[part] == 0, START, targets))
+        table.record(nodes, actions[part], np.where(after[part] == 0, START_NODE, targets))
     arrays, expected = table._arrays, np.zeros((300, 2, 5), dtype=np.int64)
     np.add.at(expected, (states, actions, after), 1)
-    numbers = {START: 0} | {int(table.add(np.array([[k]]))[0]): k for k in range(1, 5)}
+    numbers = {START_NODE: 0} | {int(table.add(np.array([[k]]))[0]): k for k in range(1, 5)}
     for state in range(300):
         node = table.add(np.array([[state]]))[0]
         for action in range(2):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mbagent import ModelLearningAgent
-from mbagent.models.tabular import TableModel, toy_text_model
+from mbagent.models.tabular import TabularMDP, toy_text_model
 from mbagent_envs.random_keys import derive
 
 
@@ -49,4 +49,4 @@ def test_a_world_without_a_table_and_a_table_with_holes_are_refused() -> None:
         toy_text_model(gym.make("Blackjack-v1"))
     ones = np.ones(2)
     with pytest.raises(ValueError, match="summing to one"):
-        TableModel(np.array([0, 1, 2]), np.zeros(2, np.int64), ones == 0, ones / 2, 1, np.zeros(1, np.int64))
+        TabularMDP(np.array([0, 1, 2]), np.zeros(2, np.int64), ones == 0, ones / 2, 1, np.zeros(1, np.int64))

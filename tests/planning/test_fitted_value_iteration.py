@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mbagent.models.base import KnownModel
+from mbagent.models.base import ExactModel
 from mbagent.models.neural.sampling import independent_successors
 from mbagent.models.protocol import Successors, as_keys
 from mbagent.planning.fitted_value_iteration import Task, greedy_actions, learn_values
@@ -10,7 +10,7 @@ from mbagent.types import Bools, Floats, Randomness, States
 from mbagent_envs.random_keys import uniforms
 
 
-class Bulbs(KnownModel):
+class Bulbs(ExactModel):
     """Bits that go out on their own; action i > 0 lights bit i - 1."""
 
     def __init__(self, n: int, lasts: float | tuple[float, ...] = 0.8, n_actions: int | None = None) -> None:
@@ -18,8 +18,8 @@ class Bulbs(KnownModel):
         self.lasts = lasts
 
     def sample(self, states: States, actions: States, rng: Randomness) -> tuple[States, Bools]:
-        luck = uniforms(as_keys(rng, len(states)), states.shape[1])
-        return (luck < self._on(states, actions)).astype(np.int64), np.zeros(len(states), dtype=np.bool_)
+        noise = uniforms(as_keys(rng, len(states)), states.shape[1])
+        return (noise < self._on(states, actions)).astype(np.int64), np.zeros(len(states), dtype=np.bool_)
 
     def successors(self, states: States, actions: States, n_samples: int, seed: int) -> Successors:
         on = np.column_stack([self._on(states, actions), np.zeros(len(states))])
@@ -40,7 +40,7 @@ def count_bits(states: States, actions: States, next_states: States) -> Floats:
     return counts
 
 
-def task(model: KnownModel, goal: object = count_bits, seed: int = 0) -> Task:
+def task(model: ExactModel, goal: object = count_bits, seed: int = 0) -> Task:
     start = np.zeros((1, len(model.cardinalities)), dtype=np.int64)
     return Task(model, goal, start, gamma=0.9, seed=seed)  # type: ignore[arg-type]
 
@@ -63,7 +63,7 @@ def test_behaviour_by_learned_values_looks_beyond_one_step() -> None:
     assert greedy_actions(problem, leaf, np.array([[0, 0]]), 0)[0] == 2
 
 
-class Catch(KnownModel):
+class Catch(ExactModel):
     """A ball falls down its column, row by row; the actions move a paddle to the left or right, or leave it."""
 
     def __init__(self, width: int, height: int) -> None:

@@ -3,7 +3,7 @@ import pytest
 
 from mbagent.planning.graph_search import GraphSearch
 from mbagent.planning.planner import Planner, PlannerSettings
-from mbagent.planning.planners import MachinePlanner
+from mbagent.planning.planners import ValueIterationPlanner
 from mbagent.types import Floats
 from tests.worlds import optimal_q, planner_for, prize_corridor, random_table
 
@@ -29,7 +29,7 @@ def test_search_repairs_a_lookahead_too_short_to_see_the_prize(seed: int) -> Non
     # A corridor whose states pay the less the further they are from the prize, which lies 9 steps to the right.
     table, rewards = prize_corridor()
     short = PlannerSettings(lookahead_states=4, num_simulations=600, seed=seed)
-    greedy = planner_alone(MachinePlanner(short), table, rewards).plan(np.array([[0]]))
+    greedy = planner_alone(ValueIterationPlanner(short), table, rewards).plan(np.array([[0]]))
     assert greedy.values[0, 0] == greedy.values[0, 1]
     plan = planner_alone(GraphSearch(short), table, rewards).plan(np.array([[0]]))
     assert plan.actions[0] == 1
@@ -62,10 +62,10 @@ def test_what_was_imagined_is_counted() -> None:
     table, rewards = random_table(25, 3, 1), np.zeros(25)
     planner = GraphSearch(PlannerSettings(num_simulations=8, lookahead_states=1))
     planner_alone(planner, table, rewards).plan(np.array([[0]]))
-    once = planner.imagined
+    once = planner.expanded
     assert once > 0
     planner.plan(np.array([[0]]))
-    assert planner.imagined == 2 * once
+    assert planner.expanded == 2 * once
 
 
 def test_golden_graph() -> None:

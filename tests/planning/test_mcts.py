@@ -3,7 +3,7 @@ import pytest
 
 from mbagent.planning.flat_monte_carlo import FlatMonteCarlo
 from mbagent.planning.planner import PlannerSettings
-from mbagent.planning.planners import MachinePlanner, MctsPlanner
+from mbagent.planning.planners import MctsPlanner, ValueIterationPlanner
 from tests.worlds import optimal_q, planner_for, prize_corridor, random_table
 
 ROLLOUTS = PlannerSettings(leaf_values="rollouts", backup="mean", num_simulations=4000, horizon=12, gamma=0.8, c_uct=0.7)
@@ -24,7 +24,7 @@ def test_search_repairs_a_lookahead_too_short_to_see_the_prize(seed: int) -> Non
     # A corridor: the prize lies 9 steps to the right, the lookahead machine holds 4 states; the search must grow it.
     table, rewards = prize_corridor()
     short = PlannerSettings(max_states=1, lookahead_states=4, num_simulations=600, wave=4, learn_values=False, seed=seed)
-    greedy = planner_for(MachinePlanner(short), table, rewards).plan(np.array([[0]]))
+    greedy = planner_for(ValueIterationPlanner(short), table, rewards).plan(np.array([[0]]))
     assert greedy.values[0, 0] == greedy.values[0, 1]
     plan = planner_for(MctsPlanner(short), table, rewards).plan(np.array([[0]]))
     assert plan.actions[0] == 1

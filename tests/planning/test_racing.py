@@ -5,13 +5,13 @@ import pytest
 
 from mbagent.planning.fitted_value_iteration import Task
 from mbagent.planning.planner import PlannerSettings
-from mbagent.planning.planners import MachinePlanner, MctsPlanner
-from mbagent.planning.racing import BLOCKS, STEPS, Way, _Trial, best_way
+from mbagent.planning.planners import MctsPlanner, ValueIterationPlanner
+from mbagent.planning.racing import BLOCK_STEPS, MOST_BLOCKS, LookaheadConfig, _Trial, best_config
 from mbagent.planning.value_function import LOWEST_KNOWN
 from mbagent.types import Actions, Bools, Floats, Randomness, States
 from tests.planning.test_fitted_value_iteration import Bulbs, count_bits
 
-WAYS = tuple(Way(LOWEST_KNOWN, n, 1) for n in range(1, 5))
+WAYS = tuple(LookaheadConfig(LOWEST_KNOWN, n, 1) for n in range(1, 5))
 N_BULBS = 14
 START = np.zeros((1, N_BULBS), dtype=np.int64)
 
@@ -19,12 +19,12 @@ START = np.zeros((1, N_BULBS), dtype=np.int64)
 def best(*actions: int) -> int:
     """Which of several ways plays best, each taking always one action."""
     task = Task(Bulbs(3, lasts=0.5), count_bits, np.zeros((1, 3), dtype=np.int64), gamma=0.99, seed=0)
-    ways = WAYS[: len(actions)]
+    configs = WAYS[: len(actions)]
 
-    def act(way: Way, states: States) -> Actions:
-        return np.full(len(states), actions[ways.index(way)])
+    def act(config: LookaheadConfig, states: States) -> Actions:
+        return np.full(len(states), actions[configs.index(config)])
 
-    return ways.index(best_way(task, ways, act))
+    return configs.index(best_config(task, configs, act))
 
 
 def test_a_better_way_is_found() -> None:
@@ -43,12 +43,12 @@ def test_no_way_is_played_twice_over() -> None:
     """The best so far meets each of the others with the episodes that it has played already."""
     calls: list[tuple[int, int]] = []
 
-    def act(way: Way, states: States) -> Actions:
-        calls.append((way.states, len(states)))
-        return np.full(len(states), way.states % 3)
+    def act(config: LookaheadConfig, states: States) -> Actions:
+        calls.append((config.states, len(states)))
+        return np.full(len(states), config.states % 3)
 
-    best_way(Task(Bulbs(3, lasts=0.5), count_bits, np.zeros((1, 3), dtype=np.int64), 0.99, 0), WAYS[:3], act)
-    assert max(Counter(calls).values()) <= BLOCKS * STEPS
+    best_config(Task(Bulbs(3, lasts=0.5), count_bits, np.zeros((1, 3), dtype=np.int64), 0.99, 0), WAYS[:3], act)
+    assert max(Counter(calls).values()) <= MOST_BLOCKS * BLOCK_STEPS
 
 
 def test_episodes_that_end_earn_nothing_more() -> None:
@@ -59,8 +59,8 @@ def test_episodes_that_end_earn_nothing_more() -> None:
 
     task = Task(Ending(1), count_bits, np.zeros((1, 1), dtype=np.int64), gamma=0.5, seed=0)
     lit, dark = (
-        _Trial(task, WAYS[0], lambda way, s: np.ones(len(s), int)),
-        _Trial(task, WAYS[0], lambda way, s: np.zeros(len(s), int)),
+        _Trial(task, WAYS[0], lambda config, s: np.ones(len(s), int)),
+        _Trial(task, WAYS[0], lambda config, s: np.zeros(len(s), int)),
     )
     assert set(lit.returns(3)) == {1.0}
     assert set(dark.returns(3)) == {0.0}
@@ -70,21 +70,21 @@ def settings(**changes: object) -> PlannerSettings:
     return PlannerSettings(gamma=0.9, max_states=10, lookahead_states=4, num_simulations=4, wave=4, **changes)  # type: ignore[arg-type]
 
 
-def planner(kind: type[MachinePlanner] = MctsPlanner, **changes: object) -> MachinePlanner:
+def planner(kind: type[ValueIterationPlanner] = MctsPlanner, **changes: object) -> ValueIterationPlanner:
     made = kind(settings(**changes))
     made.set_model(Bulbs(N_BULBS), START)
     made.set_goal(count_bits)
     return made
 
 
-@pytest.mark.parametrize("kind", [MachinePlanner, MctsPlanner])
-def test_learned_values_are_used_where_they_play_better(kind: type[MachinePlanner]) -> None:
+@pytest.mark.parametrize("kind", [ValueIterationPlanner, MctsPlanner])
+def test_learned_values_are_used_where_they_play_better(kind: type[ValueIterationPlanner]) -> None:
     """Of many bits that go out, whichever is off should be lit; looking ahead thinly tells luck from merit badly."""
     states = np.eye(N_BULBS, dtype=np.int64)[:5] ^ 1
     found = planner(kind)
     np.testing.assert_array_equal(found.plan(states).actions, np.arange(1, 6))
-    assert found._way is not None
-    assert len(found._way.leaf.weights)
+    assert found._config is not None
+    assert len(found._config.leaf.weights)
 
 
 def test_plans_do_not_hang_on_what_else_is_planned() -> None:
@@ -101,18 +101,18 @@ def test_rehearsal_knows_neither_clock_nor_memory() -> None:
     timed.plan(START)
     assert timed.settings.time_budget == 0.01
     assert timed.settings.reuse_tree
-    assert timed._way is not None
-    assert planner()._chosen_way().states == timed._way.states
+    assert timed._config is not None
+    assert planner()._chosen_config().states == timed._config.states
 
 
 def test_values_go_with_their_goal() -> None:
     made = planner()
     made.plan(START)
-    first = made._way
+    first = made._config
     made.set_goal(lambda s, a, n: -count_bits(s, a, n))
-    assert made._way is None
+    assert made._config is None
     assert made.plan(START).actions[0] == 0
-    assert made._way is not first
+    assert made._config is not first
 
 
 def test_a_goal_that_fails_while_values_are_learned_leaves_the_planner_usable() -> None:
@@ -136,6 +136,6 @@ def test_a_goal_that_fails_while_values_are_learned_leaves_the_planner_usable() 
 def test_learning_values_can_be_switched_off() -> None:
     made = planner(learn_values=False)
     made.plan(START)
-    assert made._way == Way(LOWEST_KNOWN, 4, made.settings.lookahead_samples)
+    assert made._config == LookaheadConfig(LOWEST_KNOWN, 4, made.settings.lookahead_samples)
     with pytest.raises(ValueError, match="learn_values must be True or False"):
         settings(learn_values=1)

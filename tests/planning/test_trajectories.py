@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mbagent.planning.planner import PlannerSettings
-from mbagent.planning.planners import MachinePlanner, MctsPlanner
-from mbagent.planning.trajectories import ForeseeingPlanner, Foresight, likeliest_futures
+from mbagent.planning.planners import MctsPlanner, ValueIterationPlanner
+from mbagent.planning.trajectories import PlanTrace, TracingPlanner, likeliest_trajectories
 from tests.worlds import TableWorld, arrival_goal, random_table
 
 SETTINGS = {
@@ -15,13 +15,13 @@ SETTINGS = {
 }
 
 
-def foresight(planner: MachinePlanner, ends: tuple[int, ...] = ()) -> Foresight:
+def trace(planner: ValueIterationPlanner, ends: tuple[int, ...] = ()) -> PlanTrace:
     planner.set_model(TableWorld(random_table(9, 2, 3), ends), np.array([[0]]))
     planner.set_goal(arrival_goal(np.random.default_rng(1).normal(size=9)))
-    return planner.foresee(np.array([[0]]))
+    return planner.trace(np.array([[0]]))
 
 
-def every_future(found: Foresight, action: int, n_steps: int) -> list[tuple[float, list[int]]]:
+def every_future(found: PlanTrace, action: int, n_steps: int) -> list[tuple[float, list[int]]]:
     """All sequences of edges by plain enumeration, the likeliest first."""
     graph, whole = found.graph, []
     paths: list[tuple[float, list[int], int, int]] = [(1.0, [], found.root, action)]
@@ -31,20 +31,20 @@ def every_future(found: Foresight, action: int, n_steps: int) -> list[tuple[floa
         for edge in range(first, first + graph.counts[node, chosen]):
             longer, target = [*path, edge], int(graph.next_nodes[edge])
             here = p * graph.probabilities[edge]
-            if graph.terminated[edge] or len(longer) == n_steps or found.behaviour[target] < 0:
+            if graph.terminated[edge] or len(longer) == n_steps or found.policy[target] < 0:
                 whole.append((here, longer))
             else:
-                paths.append((here, longer, target, int(found.behaviour[target])))
+                paths.append((here, longer, target, int(found.policy[target])))
     return sorted(whole, key=lambda pair: -pair[0])
 
 
 @pytest.mark.parametrize("ends", [(), (2, 5)])
 @pytest.mark.parametrize("kind", list(SETTINGS))
 def test_the_likeliest_futures_are_those_of_plain_enumeration(kind: str, ends: tuple[int, ...]) -> None:
-    found = foresight(MctsPlanner(SETTINGS[kind]), ends)
+    found = trace(MctsPlanner(SETTINGS[kind]), ends)
     for n_steps, action in product((1, 2, 5), range(2)):
         expected = every_future(found, action, n_steps)
-        futures = likeliest_futures(found, 6, n_steps)[action]
+        futures = likeliest_trajectories(found, 6, n_steps)[action]
         assert len(futures) == min(6, len(expected))
         chances = [np.prod(found.graph.probabilities[path]) for path in futures]
         np.testing.assert_allclose(chances, [p for p, _ in expected[:6]])
@@ -53,18 +53,18 @@ def test_the_likeliest_futures_are_those_of_plain_enumeration(kind: str, ends: t
 
 def test_many_equally_likely_steps_do_not_make_the_search_for_futures_endless() -> None:
     n = 40  # 40 ** 12 futures, all alike
-    planner = MachinePlanner(PlannerSettings())
+    planner = ValueIterationPlanner(PlannerSettings())
     planner.set_model(TableWorld(np.full((n, 2, n), 1.0 / n)), np.array([[0]]))
     planner.set_goal(arrival_goal(np.arange(float(n))))
-    futures = likeliest_futures(planner.foresee(np.array([[0]])), 4, 12)
+    futures = likeliest_trajectories(planner.trace(np.array([[0]])), 4, 12)
     assert [len(path) for path in futures[0]] == [12] * 4
 
 
 @pytest.mark.parametrize("kind", list(SETTINGS))
 def test_foresight_shows_the_very_plan(kind: str) -> None:
     planner = MctsPlanner(SETTINGS[kind])
-    assert isinstance(planner, ForeseeingPlanner)
-    found = foresight(planner)
+    assert isinstance(planner, TracingPlanner)
+    found = trace(planner)
     plan = planner.plan(np.array([[0]]))
     np.testing.assert_array_equal(found.plan.values, plan.values)
     np.testing.assert_array_equal(found.plan.visits, plan.visits)

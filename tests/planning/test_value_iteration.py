@@ -8,8 +8,8 @@ from mbagent.models.mdp import ReachableMDP, StateGraph, grow_reachable
 from mbagent.models.protocol import Successors
 from mbagent.planning.lookahead import grow_lookahead
 from mbagent.planning.planner import PlannerSettings
-from mbagent.planning.planners import MachinePlanner
-from mbagent.planning.value_iteration import MOST_SAMPLES, Machine, solve
+from mbagent.planning.planners import ValueIterationPlanner
+from mbagent.planning.value_iteration import MOST_SMALL_SAMPLES, SolvedMdp, solve
 from mbagent.types import Actions, States
 from mbagent_envs.geyser_runner import GeyserRunner
 from tests.worlds import TableWorld, arrival_goal, optimal_q, random_table
@@ -56,7 +56,7 @@ def test_groups_are_solved_alike_alone_and_together() -> None:
     table, rewards = random_table(30, 2, 3), np.random.default_rng(3).normal(size=30) * 10
     world, goal = TableWorld(table), arrival_goal(rewards)
     settings = PlannerSettings(max_states=1, lookahead_states=12, horizon=6)
-    planner = MachinePlanner(settings)
+    planner = ValueIterationPlanner(settings)
     planner.set_model(world, np.array([[0]]))
     planner.set_goal(goal)
     roots = np.arange(8)[:, None]
@@ -69,7 +69,7 @@ def test_groups_are_solved_alike_alone_and_together() -> None:
 
 def test_start_states_beyond_the_budget_give_no_machine_but_a_plan() -> None:
     world = TableWorld(random_table(40, 2, 1))
-    planner = MachinePlanner(PlannerSettings(max_states=5))
+    planner = ValueIterationPlanner(PlannerSettings(max_states=5))
     planner.set_model(world, np.array([[0]]))
     planner.set_goal(arrival_goal(np.arange(40.0)))
     assert planner.plan(np.array([[0], [7]])).values.shape == (2, 2)
@@ -168,7 +168,7 @@ def test_a_prize_that_opens_many_random_states_does_not_keep_the_agent_walking(s
     # The 600 states behind the prize are far more than the lookahead holds: spent on them, the corridor itself would
     # stay half unknown, and its unknown end look better than the prize.
     world, rewards = many_corridors(60, 10)
-    planner = MachinePlanner(PlannerSettings(max_states=1, lookahead_states=40))
+    planner = ValueIterationPlanner(PlannerSettings(max_states=1, lookahead_states=40))
     planner.set_model(world, np.array([[start]]))
     planner.set_goal(arrival_goal(rewards))
     for cell in range(start, 0, -1):
@@ -190,7 +190,7 @@ def test_where_nothing_matters_in_sight_the_agent_makes_for_what_it_has_not_imag
     table = np.zeros((n, 2, n))
     for s in range(n):
         table[s, 0, max(s - 1, 0)] = table[s, 1, min(s + 1, n - 1)] = 1.0
-    planner = MachinePlanner(PlannerSettings(max_states=1, lookahead_states=6))
+    planner = ValueIterationPlanner(PlannerSettings(max_states=1, lookahead_states=6))
     planner.set_model(TableWorld(table), np.array([[0]]))
     planner.set_goal(arrival_goal((np.arange(n) == 30).astype(np.float64)))
     plan = planner.plan(np.array([[0], [1], [2]]))
@@ -202,9 +202,9 @@ def test_where_nothing_matters_in_sight_the_agent_makes_for_what_it_has_not_imag
 
 def test_a_small_machine_is_drawn_more_finely() -> None:
     drawn = SampledGame(GeyserRunner())
-    machine = Machine(drawn, drawn.start_states(64), max_states=3000, n_samples=16, seed=0)
-    assert machine.graph is not None
-    assert abs(machine.graph.probabilities - 0.2).max() < 5 * np.sqrt(0.2 * 0.8 / MOST_SAMPLES)
+    mdp = SolvedMdp(drawn, drawn.start_states(64), max_states=3000, n_samples=16, seed=0)
+    assert mdp.graph is not None
+    assert abs(mdp.graph.probabilities - 0.2).max() < 5 * np.sqrt(0.2 * 0.8 / MOST_SMALL_SAMPLES)
 
 
 def test_what_finer_draws_find_does_not_cost_the_machine() -> None:
@@ -212,10 +212,10 @@ def test_what_finer_draws_find_does_not_cost_the_machine() -> None:
     table[:, 0, 0], table[0, 0, 1:] = 1.0, 0.002  # ways out of one state, all of which only many draws meet
     table[0, 0, 1] = 0.5
     table[0, 0, 0] = 1.0 - table[0, 0, 1:].sum()
-    machine = Machine(SampledWorld(table), np.array([[0]]), max_states=5, n_samples=4, seed=0)
-    assert machine.graph is not None
-    assert 2 <= machine.graph.expanded.sum() <= 5
-    assert not grow_reachable(SampledWorld(table), np.array([[0]]), 5, MOST_SAMPLES, 0)[1]
+    mdp = SolvedMdp(SampledWorld(table), np.array([[0]]), max_states=5, n_samples=4, seed=0)
+    assert mdp.graph is not None
+    assert 2 <= mdp.graph.expanded.sum() <= 5
+    assert not grow_reachable(SampledWorld(table), np.array([[0]]), 5, MOST_SMALL_SAMPLES, 0)[1]
 
 
 class SampledWorld(TableWorld):

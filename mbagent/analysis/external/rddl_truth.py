@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mbagent.adapters.rddl import RddlEnv, load_rddl
-from mbagent.models.base import KnownModel
+from mbagent.models.base import ExactModel
 from mbagent.models.protocol import Successors, as_keys
 from mbagent.models.systematic_sampling import thin
 from mbagent.types import Actions, Bools, Floats, Randomness, States
@@ -136,7 +136,7 @@ class _Rules:
         return np.array([chances[name] for name in self.fluents]), reward
 
 
-class RddlModel(KnownModel):
+class RddlModel(ExactModel):
     """A tabulated domain behind the models' protocol.
 
     Args:

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from mbagent.models.base import KnownModel
+from mbagent.models.base import ExactModel
 from mbagent.models.protocol import Successors, as_keys
 from mbagent.spaces import ActionEnumeration, FactoredSpace
 from mbagent.types import Actions, Bools, Floats, Randomness, States
@@ -23,7 +23,7 @@ STARTS = 64
 Outcome = tuple[bytes, bool]
 
 
-class SnapshotModel(KnownModel):
+class SnapshotModel(ExactModel):
     """A world known by trying: of every state met there is a copy of the environment, and copies of that are stepped.
 
     Right for environments that can be copied, draw from ``np_random`` alone, and show all that matters. Limits of steps are

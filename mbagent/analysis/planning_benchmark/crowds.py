@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mbagent.models.base import KnownModel
+from mbagent.models.base import ExactModel
 from mbagent.models.neural.sampling import independent_successors
 from mbagent.models.protocol import Successors, as_keys
 from mbagent.planning.planner import PlannerSettings
@@ -25,7 +25,7 @@ EPISODES, STEPS = 16, 40
 _SALT = 0xC40D
 
 
-class IndependentModel(KnownModel):
+class IndependentModel(ExactModel):
     """A world whose variables change independently, given state and action; no episode ends.
 
     Args:

@@ -133,13 +133,13 @@ def _timed(task: NetworkTask, effort: Effort, n_roots: int, repetitions: int) ->
     roots, seconds, drawn = np.resize(task.roots, (n_roots, task.roots.shape[1])), [], 0.0
     planner = planner_for(task, task.goals[0], effort, 0)
     for repetition in range(repetitions + 1):  # the first one compiles and makes room
-        calls, before = max(1, 16 // n_roots), planner.imagined
+        calls, before = max(1, 16 // n_roots), planner.expanded
         began = time.process_time()
         for call in range(calls):
             planner.plan(np.roll(roots, call, axis=0) if n_roots > 1 else task.roots[call % len(task.roots)][None])
         if repetition:
             seconds.append((time.process_time() - began) / calls)
-            drawn = (planner.imagined - before) / calls
+            drawn = (planner.expanded - before) / calls
     return float(np.median(seconds)), drawn
 
 

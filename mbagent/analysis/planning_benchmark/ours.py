@@ -11,7 +11,7 @@ import numpy as np
 
 from mbagent.analysis.planning_benchmark.peers import Speed
 from mbagent.analysis.planning_benchmark.worlds import World
-from mbagent.models.tabular import TableModel
+from mbagent.models.tabular import TabularMDP
 from mbagent.planning.machine_search import known_machine, search_machine
 from mbagent.planning.planner import PlannerSettings, best_actions
 from mbagent.planning.planners import MctsPlanner
@@ -30,12 +30,12 @@ Prepare: TypeAlias = Callable[[World], TableSearch]
 """What is done once for a world: the rules and the goal are given, and what a state is worth that was not looked beyond."""
 
 
-def as_model(world: World) -> TableModel:
+def as_model(world: World) -> TabularMDP:
     """The world as a transition model of one factor."""
     n_states, n_actions, n_successors = world.successors.shape
     following, nowhere = np.ascontiguousarray(world.successors.reshape(-1)), np.zeros(0, dtype=np.int64)
     offsets = np.arange(n_states * n_actions + 1) * n_successors
-    return TableModel(offsets, following, world.ends[following], world.probabilities.reshape(-1), n_actions, nowhere)
+    return TabularMDP(offsets, following, world.ends[following], world.probabilities.reshape(-1), n_actions, nowhere)
 
 
 def with_rollouts(world: World) -> TableSearch:

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mbagent.analysis.pages import FIGURE_STYLE, to_png
-from mbagent.models.neural.influence import Influence, Module, dependent_groups, modules
+from mbagent.models.neural.influence import Influence, VariableGroup, dependent_groups, modules
 
 ALONE = "#eceff2"
 """Of a variable that no other leads to, nor it to any."""
@@ -35,7 +35,7 @@ def draw_modules(found: Influence, shape: tuple[int, ...]) -> bytes:
         return to_png(figure)
 
 
-def _colours(found: Sequence[Module], n: int) -> list[str]:
+def _colours(found: Sequence[VariableGroup], n: int) -> list[str]:
     """A colour for each variable."""
     palette = mpl.colormaps["tab20"]
     colours = [ALONE] * (n + 1)
@@ -45,7 +45,7 @@ def _colours(found: Sequence[Module], n: int) -> list[str]:
     return colours
 
 
-def _draw_plane(axes: Axes, plane: int, size: tuple[int, ...], colours: Sequence[str], groups: Sequence[Module]) -> None:
+def _draw_plane(axes: Axes, plane: int, size: tuple[int, ...], colours: Sequence[str], groups: Sequence[VariableGroup]) -> None:
     height, width = size
     framed = {int(i): number for number, group in enumerate(groups) for i in group.outputs}
     for row in range(height):

@@ -46,7 +46,7 @@ class AffectedIndex(NamedTuple):
         row: where each factor's values begin among the rows, int64 [F + 1].
         shown: where each factor's columns begin, int64 [F + 1].
         features: the lowest and highest value for which each is on, int64 [D, 2].
-        cells, adjacencies, counts, met, weights: see ``features.Layout``.
+        cells, adjacencies, counts, observed, weights: see ``features.Layout``.
         touched: units that a factor's value touches, as bits, uint64 [A or 1, R, W].
         by_adjacency: the same of meetings, uint64 [A or 1, M, W].
         always: units that do something even where everything is 0, uint64 [A, W].
@@ -72,7 +72,7 @@ class AffectedIndex(NamedTuple):
     cells: Ints
     adjacencies: Ints
     counts: Ints
-    met: Bools
+    observed: Bools
     weights: Ints
     touched: Words
     by_adjacency: Words
@@ -121,7 +121,7 @@ def affected_index(layout: Layout, graphs: Graphs, synchronic: Graphs, cardinali
         cells=layout.cells,
         adjacencies=layout.adjacencies,
         counts=layout.counts,
-        met=layout.met,
+        observed=layout.observed,
         weights=layout.weights,
         touched=touched,
         by_adjacency=by_adjacency,

@@ -24,7 +24,7 @@ class Graphs(NamedTuple):
 
     Attributes:
         changing: units that have graphs, int64.
-        pairs: where the pairs (way, value) of each unit begin, int64 [U + 1]; pair ``action_class * cardinality + value``, with the
+        pairs: where each variable's pairs (action class, value) begin, int64 [U + 1]; pair ``action_class * cardinality + value``, with the
             action's way, see ``encoding.ActionEncoding``.
         entries: where the entries of each pair begin, int64 [pairs + 1].
         values: the value that an entry is about, int64 [E].

@@ -23,7 +23,7 @@ LogPredictive: TypeAlias = Callable[[TransitionBatch, TransitionBatch], Floats]
 LENGTHS = (50, 100, 200, 400, 800)
 """Runs of so many newest steps are looked at, the shorter ones only if they surprise more than others."""
 
-LONG = 400
+LONGEST_RUN = 400
 """Runs so long are looked at in any case: what chance decided before may follow a rule now, and surprises nobody."""
 
 UNUSUAL = 0.1
@@ -38,13 +38,13 @@ FEWEST_RUNS = 6
 PARTS = 4
 """Each part of a run is foretold from the others."""
 
-MOST_ROWS = 2500
+MOST_RUN_ROWS = 2500
 """Of all steps, so many evenly chosen ones are learned from."""
 
 DEAREST = 7.0
 """What one step can cost a variable at most, nats: one that nothing foretold says no more than another."""
 
-SURE = 10.0
+SURE_CHANGE = 10.0
 """Nats by which a run must surprise more than any early one, and be foretold better; plus the log of the number of variables."""
 
 
@@ -60,11 +60,11 @@ def last_changes(rows: TransitionBatch, n_variables: int, log_predictive: LogPre
     lengths = [length for length in LENGTHS if FEWEST_RUNS * length <= n]
     if not lengths:
         return since
-    limit, known, runs = SURE + math.log(n_variables), _logs(thinned(rows, MOST_ROWS), rows, log_predictive), []
+    limit, known, runs = SURE_CHANGE + math.log(n_variables), _logs(thinned(rows, MOST_RUN_ROWS), rows, log_predictive), []
     for length in lengths:
         surprise = _surprise(known, length)
         suspect = surprise > 0.0
-        if surprise[suspect].sum() > limit or length >= LONG:
+        if surprise[suspect].sum() > limit or length >= LONGEST_RUN:
             anew = _crossed(rows, np.arange(n - length, n), log_predictive)
             gain = anew - known[-length:]
             runs.append(_Run(length, anew, suspect, np.where(_gaining(suspect, gain, limit), gain.sum(axis=0), 0.0)))

@@ -20,7 +20,7 @@ from mbagent.models.dbn.smoothing import Pools, Smoothing, smoothing_of
 from mbagent.models.held_out import FORETOLD, better, thinned
 from mbagent.types import Bools, Floats, Ints
 
-SURE = 5.0
+SURE_GAIN = 5.0
 """Standard errors by which the slope of a partner must differ from zero."""
 
 MOST_LOOKED_AT = 5000
@@ -29,7 +29,7 @@ MOST_LOOKED_AT = 5000
 MOST_CANDIDATES = 200
 """Ordered factors and parts of actions; where there are more, no partners are looked for."""
 
-MOST_ENTRIES = 50_000
+MOST_NODES = 50_000
 """Nodes that a sum with a partner may take: its values times the factor's, times how many steps from the sum that ends."""
 
 
@@ -97,8 +97,8 @@ def likely_operands(factors: Sequence[int], among: Sequence[Operand], rows: Tran
         own = [operand.factor == factor for operand in among]
         t[own, i] = 0.0
         best = int(np.abs(t[:, i]).argmax())
-        likely = (among[best], int(np.sign(t[best, i]))) if abs(t[best, i]) > SURE else None
-        found.append(likely if likely and _entries(*likely, among[own.index(True)], some) <= MOST_ENTRIES else None)
+        likely = (among[best], int(np.sign(t[best, i]))) if abs(t[best, i]) > SURE_GAIN else None
+        found.append(likely if likely and _entries(*likely, among[own.index(True)], some) <= MOST_NODES else None)
     return found
 
 
@@ -168,13 +168,13 @@ class EffectModel(NamedTuple):
 ABSOLUTE_EFFECT = EffectModel(Effect.ABSOLUTE)
 """Where it goes."""
 
-SUMS = (Effect.SUM, Effect.DIFFERENCE, Effect.CLIPPED_SUM, Effect.CLIPPED_DIFFERENCE)
+SUM_EFFECTS = (Effect.SUM, Effect.DIFFERENCE, Effect.CLIPPED_SUM, Effect.CLIPPED_DIFFERENCE)
 """Manners that ask of sums."""
 
 SUM_ERRORS = 1.0
 """Standard errors by which a sum must foretell held-out values better: what an action's number is may mean nothing."""
 
-ENOUGH, MOST_FOLDS = 1000, 6
+ENOUGH_HELD_OUT, MOST_EFFECT_FOLDS = 1000, 6
 """So many held-out rows tell which manner fits; where there are fewer, others are held out, too, so many times in all."""
 
 
@@ -216,9 +216,9 @@ def _summed(effects: tuple[Effect, Effect], operand: Operand, sign: int) -> Effe
 
 def more_folds(train: TransitionBatch, held_out: TransitionBatch) -> list[Bools]:
     """Which rows to hold out, besides those that are, where these are too few to tell manners apart, [folds][N]."""
-    if (n := len(train) // MOST_FOLDS) == 0:
+    if (n := len(train) // MOST_EFFECT_FOLDS) == 0:
         return []
-    folds = min(MOST_FOLDS - 1, -(-(ENOUGH - len(held_out)) // n))
+    folds = min(MOST_EFFECT_FOLDS - 1, -(-(ENOUGH_HELD_OUT - len(held_out)) // n))
     return [np.arange(len(train)) // n == fold for fold in range(folds)]
 
 
@@ -235,7 +235,9 @@ def questions_for_effect(effect: Effect, variable: int, cardinality: int, n_acti
     if effect is Effect.ABSOLUTE or cardinality == 2 or (observed.now == observed.then).all():
         return ask(variable, cardinality, observed)
     return (
-        _sums(effect, variable, cardinality, n_actions, observed) if effect in SUMS else _moves(variable, cardinality, observed)
+        _sums(effect, variable, cardinality, n_actions, observed)
+        if effect in SUM_EFFECTS
+        else _moves(variable, cardinality, observed)
     )
 
 

@@ -127,7 +127,7 @@ def graph_outcomes(
     listed, values, mutex_members = work.variables, work.values, work.mutex_members
     per_mutex, opened, base = work.per_mutex, work.opened, work.base
     p, encoding = work.p, g.encoding
-    counts, met, weights, late_end = g.counts, g.met, g.weights, len(g.end_first) > 0
+    counts, observed, weights, late_end = g.counts, g.observed, g.weights, len(g.end_first) > 0
     n_actions, first_adjacency = len(always), len(features) + encoding.n_features
     place = place_of(state)
     n_different = show_state(state, shown, features, different, on)
@@ -181,8 +181,10 @@ def graph_outcomes(
             n_open += 1
         _show_action(encoding, action, len(features), False, on)
         n_live = _write(total, n_open, ended, base, opened, mutex_members, variables, members, p, n_grid, out)
-        if len(counts) or len(met):
-            n_live = leave_out(counts, met, weights, cells, state, out.states, out.terminated, out.probabilities, total, n_live)
+        if len(counts) or len(observed):
+            n_live = leave_out(
+                counts, observed, weights, cells, state, out.states, out.terminated, out.probabilities, total, n_live
+            )
         out.counts[action], out.left_out[action] = n_live, p.left[0]
         total += n_live
     for i in range(n_different):
@@ -371,7 +373,7 @@ def _fill(
 def _mutex_distribution(
     mutex: int, first: int, touched: Ints, variables: Ints, exactly: bool, rates: Floats, mutex_members: Ints, out: Floats
 ) -> int:
-    """Lists a coupling's touched units from ``mutex_members[first]`` on, and their chances; returns the only one worth drawing, or -1.
+    """Lists a mutex group's affected variables from ``mutex_members[first]`` on, with probabilities; returns the only possible one, or -1.
 
     As ``mutexes.mutex_distribution``; the last chance is that of none.
     """

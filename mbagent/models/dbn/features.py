@@ -97,7 +97,7 @@ class Layout(NamedTuple):
         mutex_members: units, all bits, of which at most one is on after a step.
         exactly: whether it is exactly one, bool [Q].
         mutex_of: coupling that each unit is in, or -1, int64 [U].
-        counts, met: what planes keep to, see ``invariants.py``.
+        counts, observed: what planes keep to, see ``invariants.py``.
         weights: what each channel's value counts in the number of a combination, int64 [C].
     """
 
@@ -117,7 +117,7 @@ class Layout(NamedTuple):
     exactly: Bools
     mutex_of: Ints
     counts: Ints
-    met: Bools
+    observed: Bools
     weights: Ints
 
 
@@ -349,7 +349,7 @@ def question(
     return Question(variable, np.full(len(pairs), value), pairs, target, context)
 
 
-AT_ONCE = 20_000_000
+ENTRIES_AT_ONCE = 20_000_000
 """Entries of a table whose rows are told apart at once."""
 
 
@@ -360,7 +360,7 @@ def distinct(table: NDArray[Any], also: Ints | None = None) -> tuple[Ints, Ints]
         table: integers or booleans [N, D].
         also: one more column, int64 [N].
     """
-    step = max(1, AT_ONCE // max(table.shape[1], 1))
+    step = max(1, ENTRIES_AT_ONCE // max(table.shape[1], 1))
     parts = [hash_rows(table[begin : begin + step]) for begin in range(0, len(table), step)]
     tags = np.concatenate([np.zeros(0, dtype=np.uint64), *parts])
     if also is not None:

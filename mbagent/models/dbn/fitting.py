@@ -71,17 +71,17 @@ MANY = 8.0
 APART = 6.0
 """Standard errors that two columns' errors must go together by, beyond what the largest of so many reaches by chance."""
 
-MOST_ENTRIES = 4_000_000
+MOST_ERRORS = 4_000_000
 """Entries of the table of errors; of more rows, evenly chosen ones are looked at."""
 
 
-AT_ONCE = 2000
+ROWS_AT_ONCE = 2000
 """Rows that are handed to the compiled kernels at once, which read wide integers."""
 
 
 def uncertain_rows(rows: TransitionBatch, layout: Layout, graphs: Graphs, variables: Ints) -> Bools:
     """In which rows some units need their late graphs, bool [N, len(units)]."""
-    found = [sampling.uncertain(part.states, part.actions, layout, graphs, variables) for part in rows.parts(AT_ONCE)]
+    found = [sampling.uncertain(part.states, part.actions, layout, graphs, variables) for part in rows.parts(ROWS_AT_ONCE)]
     return np.concatenate([np.zeros((0, len(variables)), dtype=np.bool_), *found])
 
 
@@ -157,7 +157,7 @@ def find_dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, usual:
     variable_of = np.empty(layout.n_factors, dtype=np.int64)
     variable_of[layout.members] = np.repeat(np.arange(len(layout.outputs)), np.diff(layout.first))
     owner = variable_of[layout.factor]
-    most = max(1000, MOST_ENTRIES // max(n_features, 1))
+    most = max(1000, MOST_ERRORS // max(n_features, 1))
     some = rows.select(usual[np.linspace(0, len(usual) - 1, min(len(usual), most)).astype(np.int64)])
     found = [Asked(variable, features) for variable, features in _dependent(layout, graphs, some, owner).items()]
     if last in graphs.changing:
@@ -191,7 +191,7 @@ def _dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, owner: Int
 NO_EFFECTS: Mapping[int, EffectModel] = MappingProxyType({})
 """All factors are asked where they go."""
 
-SOME_ROWS = 4000
+MUTEX_ROWS = 4000
 """Rows on which it is looked at how often bits should be on together."""
 
 
@@ -377,7 +377,7 @@ def _with_mutexes(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Layo
         return layout
     factors = layout.members[layout.first[bits]]
     on = rows.after[:, factors].astype(np.float32)
-    some = np.linspace(0, len(rows) - 1, min(len(rows), SOME_ROWS)).astype(np.int64)
+    some = np.linspace(0, len(rows) - 1, min(len(rows), MUTEX_ROWS)).astype(np.int64)
     start = np.concatenate([[0], np.cumsum(_cardinalities(layout))]).astype(np.int64)
     probs = np.empty((len(some), int(start[-1])))
     few = rows.select(some)

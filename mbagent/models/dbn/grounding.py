@@ -93,7 +93,7 @@ def instantiate(local: LocalGraphs, board: PlaneLayout) -> tuple[Layout, Graphs,
 
 def with_invariants(layout: Layout, invariants: Invariants) -> Layout:
     """The layout with other laws."""
-    return layout._replace(counts=invariants.counts, met=invariants.met)
+    return layout._replace(counts=invariants.counts, observed=invariants.observed)
 
 
 def with_mutexes(layout: Layout, mutexes: Sequence[Mutex]) -> Layout:

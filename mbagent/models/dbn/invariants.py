@@ -16,7 +16,7 @@ import numpy as np
 
 from mbagent.data import TransitionBatch
 from mbagent.models.protocol import Successors
-from mbagent.models.systematic_sampling import RARE
+from mbagent.models.systematic_sampling import RARE_VALUE
 from mbagent.spaces import PlaneLayout
 from mbagent.types import Bools, Floats, Ints
 from mbagent_envs.jit import compiled
@@ -42,16 +42,16 @@ class Invariants(NamedTuple):
 
     Attributes:
         counts: channels and values of which the number of cells never changes, int64 [K, 2].
-        met: which combinations of the channels' values are met in a cell, bool [P]; empty where any may be.
+        observed: which combinations of the channels' values are met in a cell, bool [P]; empty where any may be.
     """
 
     counts: Ints
-    met: Bools
+    observed: Bools
 
     @property
     def none(self) -> bool:
         """Whether anything goes."""
-        return len(self.counts) == 0 and len(self.met) == 0
+        return len(self.counts) == 0 and len(self.observed) == 0
 
 
 NO_INVARIANTS = Invariants(np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.bool_))
@@ -81,7 +81,9 @@ def find_invariants(rows: TransitionBatch, board: PlaneLayout, cardinalities: Se
         board: where cells lie.
         cardinalities: number of values of each channel's cells.
     """
-    return Invariants(_find_counts(rows.select(~rows.terminated), board, cardinalities), _find_met(rows, board, cardinalities))
+    return Invariants(
+        _find_counts(rows.select(~rows.terminated), board, cardinalities), _find_observed(rows, board, cardinalities)
+    )
 
 
 def _find_counts(rows: TransitionBatch, board: PlaneLayout, cardinalities: Sequence[int]) -> Ints:
@@ -96,14 +98,14 @@ def _find_counts(rows: TransitionBatch, board: PlaneLayout, cardinalities: Seque
     return np.asarray(found, dtype=np.int64).reshape(-1, 2)
 
 
-def _find_met(rows: TransitionBatch, board: PlaneLayout, cardinalities: Sequence[int]) -> Bools:
+def _find_observed(rows: TransitionBatch, board: PlaneLayout, cardinalities: Sequence[int]) -> Bools:
     """Combinations met; nothing where any may be, or where new ones keep coming.
 
     How probable it is that the next state shows a new one is told by those that were met in one state only (Good 1953).
     """
     size, weights = n_combinations(cardinalities), radix(cardinalities)
     if size == 0 or len(cardinalities) < 2 or len(rows) == 0:
-        return NO_INVARIANTS.met
+        return NO_INVARIANTS.observed
     times = np.zeros(size, dtype=np.int64)
     for part in rows.parts(1000):
         planes = board.to_planes(part.after)
@@ -112,11 +114,11 @@ def _find_met(rows: TransitionBatch, board: PlaneLayout, cardinalities: Sequence
         first = np.ones(code.shape, dtype=np.bool_)  # of its kind in this state
         first[:, 1:] = code[:, 1:] != code[:, :-1]
         times += np.bincount(code[first], minlength=size)
-    return times > 0 if (times == 1).sum() <= RARELY_NEW * len(rows) and (times == 0).any() else NO_INVARIANTS.met
+    return times > 0 if (times == 1).sum() <= RARELY_NEW * len(rows) and (times == 0).any() else NO_INVARIANTS.observed
 
 
 @compiled
-def keeps(counts: Ints, met: Bools, weights: Ints, cells: Ints, state: Ints, following: Ints) -> bool:
+def keeps(counts: Ints, observed: Bools, weights: Ints, cells: Ints, state: Ints, following: Ints) -> bool:
     """Whether a next state [F] keeps all laws, of which the counts are those of the state before."""
     n_channels, height, width = cells.shape
     for k in range(len(counts)):
@@ -126,30 +128,30 @@ def keeps(counts: Ints, met: Bools, weights: Ints, cells: Ints, state: Ints, fol
                 surplus += int(following[here[y, x]] == value) - int(state[here[y, x]] == value)
         if surplus != 0:
             return False
-    if len(met):
+    if len(observed):
         for y in range(height):
             for x in range(width):
                 code = 0
                 for c in range(n_channels):
                     code += weights[c] * following[cells[c, y, x]]
-                if not met[code]:
+                if not observed[code]:
                     return False
     return True
 
 
 @compiled
-def all_kept(counts: Ints, met: Bools, weights: Ints, cells: Ints, states: Ints, following: Ints) -> Bools:
+def all_kept(counts: Ints, observed: Bools, weights: Ints, cells: Ints, states: Ints, following: Ints) -> Bools:
     """``keeps`` for rows, bool [B]."""
     result = np.empty(len(states), dtype=np.bool_)
     for b in range(len(states)):
-        result[b] = keeps(counts, met, weights, cells, states[b], following[b])
+        result[b] = keeps(counts, observed, weights, cells, states[b], following[b])
     return result
 
 
 @compiled
 def leave_out(
     counts: Ints,
-    met: Bools,
+    observed: Bools,
     weights: Ints,
     cells: Ints,
     state: Ints,
@@ -166,16 +168,16 @@ def leave_out(
     kept, lost = 0.0, 0.0
     for q in range(first, first + n):
         if not terminated[q]:
-            if keeps(counts, met, weights, cells, state, following[q]):
+            if keeps(counts, observed, weights, cells, state, following[q]):
                 kept += probabilities[q]
             else:
                 lost += probabilities[q]
-    if lost == 0.0 or kept < RARE * (kept + lost):
+    if lost == 0.0 or kept < RARE_VALUE * (kept + lost):
         return n
     left = first
     for q in range(first, first + n):
         over = terminated[q]
-        if over or keeps(counts, met, weights, cells, state, following[q]):
+        if over or keeps(counts, observed, weights, cells, state, following[q]):
             following[left] = following[q]
             terminated[left] = over
             probabilities[left] = probabilities[q] if over else probabilities[q] * (kept + lost) / kept
@@ -186,7 +188,7 @@ def leave_out(
 @compiled
 def leave_out_all(
     counts: Ints,
-    met: Bools,
+    observed: Bools,
     weights: Ints,
     cells: Ints,
     states: Ints,
@@ -199,7 +201,7 @@ def leave_out_all(
     left = np.empty(len(states), dtype=np.int64)
     for b in range(len(states)):
         n = offsets[b + 1] - offsets[b]
-        left[b] = leave_out(counts, met, weights, cells, states[b], following, over, chances, offsets[b], n)
+        left[b] = leave_out(counts, observed, weights, cells, states[b], following, over, chances, offsets[b], n)
     return left
 
 

@@ -39,19 +39,19 @@ from mbagent.spaces import PlaneLayout
 from mbagent.types import Bools, Ints
 from mbagent_envs.jit import compiled
 
-MOST_CELLS = 200_000_000
+MOST_TABLE_ENTRIES = 200_000_000
 """Entries of the table of columns that the search reads; of more transitions than that, some from all over are searched."""
 
 QUICK_CELLS = 50_000_000
-"""As MOST_CELLS, for a quick look that asks for single causes only."""
+"""As MOST_TABLE_ENTRIES, for a quick look that asks for single causes only."""
 
 FEWEST_CHANGES = 50
 """Cells of a channel that must have changed as another's did, before it is taken for a copy."""
 
-MOST_COUNTED = 1_000_000_000
+MOST_CELLS_COUNTED = 1_000_000_000
 """Values of cells that are gone through in all, a byte each before and after a step."""
 
-CHUNK = 50_000_000
+ENTRIES_PER_CHUNK = 50_000_000
 """Entries of the table that are made at once."""
 
 
@@ -62,7 +62,7 @@ def channel_layout(cardinalities: Sequence[int], encoding: ActionEncoding) -> La
 
 def _counted(rows: TransitionBatch) -> tuple[TransitionBatch, Ints]:
     """The rows that are gone through, and their numbers."""
-    most = max(1, MOST_COUNTED // max(1, rows.before.shape[1]))
+    most = max(1, MOST_CELLS_COUNTED // max(1, rows.before.shape[1]))
     if len(rows) <= most:
         return rows, np.arange(len(rows))
     counted = np.linspace(0, len(rows) - 1, most).astype(np.int64)
@@ -76,7 +76,7 @@ class PlaneTable:
         table: columns of the neighbourhood of all cells that look different, bool [looks, near].
         whole: whether it is of all transitions.
         most_patterns: rows that a table for a search may have.
-        every: planes of all transitions and of their next states; of evenly chosen ones where that were over MOST_COUNTED.
+        every: planes of all transitions and of their next states; of evenly chosen ones where that were over MOST_CELLS_COUNTED.
 
     Args:
         rows: N transitions.
@@ -113,7 +113,7 @@ class PlaneTable:
         self.near, self.far, self.next_far = (
             known[which] for which in (here, np.isin(kind, (ADJACENCY, ACTION)), kind == NEXT_ADJACENCY)
         )
-        self.most_patterns = (MOST_CELLS if in_pairs else QUICK_CELLS) // max(len(self.near), 1)
+        self.most_patterns = (MOST_TABLE_ENTRIES if in_pairs else QUICK_CELLS) // max(len(self.near), 1)
         self.table, self.pattern, taken = self._patterns(self.every[0], rows.actions)
         self.whole = len(taken) == len(rows)
         self.rows = rows if self.whole else rows.select(taken)
@@ -126,7 +126,7 @@ class PlaneTable:
 
         Transitions from all over are taken as long as there is room.
         """
-        most, step = self.most_patterns, max(1, CHUNK // (self.n_cells * max(len(self.near), 1)))
+        most, step = self.most_patterns, max(1, ENTRIES_PER_CHUNK // (self.n_cells * max(len(self.near), 1)))
         patterns_seen, n_parts = np.zeros((0, -(-len(self.near) // 8)), dtype=np.uint8), -(-len(planes) // step)
         pattern, taken = [np.zeros((0, self.n_cells), dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
         for number in range(n_parts):
@@ -152,7 +152,7 @@ class PlaneTable:
         return Observed(self.pattern, self.actions, now, then).select(self.cells_since(channel))
 
     def determined_by(self, channel: int) -> Ints | None:
-        """Columns that alone tell what a channel becomes, see ``windows.determined_by``; None where none do, or it changed rarely."""
+        """Features that alone determine a channel, see ``plane_features.determined_by``; None if none do, or it rarely changed."""
         before, after = (planes[:, channel] for planes in self.every)
         if (before != after).sum() < FEWEST_CHANGES:
             return None
@@ -199,14 +199,14 @@ class PlaneTable:
         return build(channel_layout(self.cardinalities, self.encoding), asked, found, smoothings, still)
 
 
-ROUNDS = 6
+REFINEMENTS = 6
 """Most times that all transitions are gone through."""
 
-WORTH = 10.0
+WORTH_SEARCHING = 10.0
 """Evidence, nats, that could be gained in a context at most, below which nothing is looked for in it."""
 
 
-LEAST = 300
+FEWEST_ROOM = 300
 """Cells of the more frequent outcome that are taken at least."""
 
 
@@ -225,7 +225,7 @@ def refine(planes: PlaneTable, asked: Sequence[Question], found: list[Search]) -
         return found
     followed = [_Followed(planes, question, search) for question, search in zip(asked, found, strict=True)]
     most, certain = planes.most_patterns, certainty(found)
-    for _ in range(ROUNDS):
+    for _ in range(REFINEMENTS):
         if not _round(planes, followed, most, certain):
             break
     return [each.search() for each in followed]
@@ -267,7 +267,7 @@ class _Followed:
         which = np.asarray([np.searchsorted(used, s.feature) if s.feature >= 0 else -1 for s in splits], dtype=np.int64)
         targets = np.concatenate([np.zeros((2, 0), dtype=np.int64), *(np.stack([s.off, s.on]) for s in splits)], axis=1)
         first = np.concatenate([[0], np.cumsum([len(s.off) for s in splits])]).astype(np.int64)
-        step = max(1, CHUNK // (planes.n_cells * (len(used) + 1)))
+        step = max(1, ENTRIES_PER_CHUNK // (planes.n_cells * (len(used) + 1)))
         for begin in range(0, len(planes.every_action), step):
             part = slice(begin, begin + step)
             values = feature_planes(planes.features[used], planes.every[0][part], planes.every_action[part])
@@ -287,7 +287,7 @@ class _Followed:
 
     def open_contexts(self, tables: Tables) -> Bools:
         """Contexts in which cells disagree, bool [C]."""
-        result: Bools = ~self.closed & (-evidences(self.e, self.n, tables) > WORTH) & (self.e > 0) & (self.e < self.n)
+        result: Bools = ~self.closed & (-evidences(self.e, self.n, tables) > WORTH_SEARCHING) & (self.e > 0) & (self.e < self.n)
         return result
 
     def graft(self, found: Sequence[Search], contexts: Ints, near: Ints) -> bool:
@@ -355,9 +355,9 @@ def _water_level(rarer: Sequence[Ints], room: int) -> int:
 def _sampled(each: _Followed, contexts: Ints, limit: int, chosen: list[Ints]) -> list[Search]:
     """A search of some cells of each of some contexts; the cells are added to ``chosen``, and their rows numbered as there.
 
-    Of the rarer outcome evenly chosen cells are taken, of the other three times as many and ``LEAST`` more. They all weigh the
-    same: that a column is on in none of the few that were taken says little of all that they stand for. What tells outcomes
-    apart can be learned from such cells, how often they come cannot; so each context is searched for itself.
+    Of the rarer outcome, evenly spaced cells are taken; of the other one, three times as many plus ``FEWEST_ROOM``. Sampled
+    cells are unweighted: a feature absent from the sample may still occur in the population. Such a sample identifies
+    discriminative features but not base rates, so each context is searched separately.
     """
     number = np.full(len(each.action) + 1, -1, dtype=np.int32)  # the last one: of cells that are not asked
     number[contexts] = np.arange(len(contexts))
@@ -369,7 +369,7 @@ def _sampled(each: _Followed, contexts: Ints, limit: int, chosen: list[Ints]) ->
     for k, context in enumerate(contexts):
         outcomes = [inside[order[ends[2 * k + e] : ends[2 * k + e + 1]]] for e in (0, 1)]
         rarer = min(limit, *(len(outcome) for outcome in outcomes))
-        sizes = [min(len(o), 3 * rarer + LEAST if len(o) == max(map(len, outcomes)) else rarer) for o in outcomes]
+        sizes = [min(len(o), 3 * rarer + FEWEST_ROOM if len(o) == max(map(len, outcomes)) else rarer) for o in outcomes]
         taken = [o[np.linspace(0, len(o) - 1, n).astype(np.int64)] for o, n in zip(outcomes, sizes, strict=True)]
         chosen += taken
         rows, positives = begun + np.arange(sum(sizes)), np.repeat([0, 1], sizes)

@@ -11,7 +11,7 @@ from scipy import special
 from mbagent.models.dbn.splits import Search
 from mbagent.types import Floats, Ints
 
-SURE = 0.02
+CERTAIN_RATE = 0.02
 """Typical rates are taken to lie this far from 0 and 1 at least."""
 
 WIDTH = 0.25
@@ -26,10 +26,10 @@ UP, DOWN = 1.0 / WIDTH**2 / (1.0 - CENTRES), 1.0 / WIDTH**2 / CENTRES
 MIXED_STRENGTH = 0.3
 """Rows that the typical rate counts for beside a mixture."""
 
-ROUNDS = 60
+EM_STEPS = 60
 """Rounds of expectation and maximisation."""
 
-LEAST = 1e-8
+LEAST_RATE = 1e-8
 """Least weight of a rate in a mixture: nothing is impossible."""
 
 MOST_LEAVES = 20_000
@@ -57,7 +57,7 @@ class LeafPrior:
 
     def rates(self, n: Ints, e: Ints, prior_mean: Floats) -> Floats:
         """Posterior mean rate."""
-        prior_mean = prior_mean.clip(SURE, 1.0 - SURE)
+        prior_mean = prior_mean.clip(CERTAIN_RATE, 1.0 - CERTAIN_RATE)
         rows, mean = self._slab(n, e, prior_mean)
         _, slab = _with_spike(rows, self.certain, n, e, prior_mean)
         spike = np.where(n == 0, prior_mean, (e == n) * 1.0)
@@ -100,10 +100,10 @@ def best_prior(searches: Sequence[Search]) -> LeafPrior:
 def fitted_prior(searches: Sequence[Search]) -> LeafPrior:
     """As ``best_prior``; a mixture fitted to the leaves where they clearly are likelier then."""
     n, e, prior_mean = _leaves(searches)
-    simple, met = _best_of(PRIORS, n, e, prior_mean), np.flatnonzero(n)
-    if len(met) == 0:
+    simple, observed = _best_of(PRIORS, n, e, prior_mean), np.flatnonzero(n)
+    if len(observed) == 0:
         return simple
-    some = met[np.linspace(0, len(met) - 1, min(len(met), MOST_LEAVES)).astype(np.int64)]
+    some = observed[np.linspace(0, len(observed) - 1, min(len(observed), MOST_LEAVES)).astype(np.int64)]
     leaves = n[some], e[some], prior_mean[some]
     mixed = _mixture(simple.certain, *leaves)
     gain = float((mixed.evidence(*leaves)[0] - simple.evidence(*leaves)[0]).sum())
@@ -115,7 +115,7 @@ def _leaves(searches: Sequence[Search]) -> tuple[Ints, Ints, Floats]:
     counts = [search.counts() for search in searches]
     nothing = np.zeros(0, dtype=np.int64)
     n, e = (np.concatenate([nothing, *(pair[i] for pair in counts)]) for i in (0, 1))
-    return n, e, np.concatenate([np.zeros(0), *(search.prior_mean for search in searches)]).clip(SURE, 1.0 - SURE)
+    return n, e, np.concatenate([np.zeros(0), *(search.prior_mean for search in searches)]).clip(CERTAIN_RATE, 1.0 - CERTAIN_RATE)
 
 
 def _best_of(priors: Sequence[LeafPrior], n: Ints, e: Ints, prior_mean: Floats) -> LeafPrior:
@@ -143,12 +143,12 @@ def _mixture(certain: float, n: Ints, e: Ints, prior_mean: Floats) -> MixedPrior
     rows, before = (_likelihoods(k * n, k * e, prior_mean, MIXED_STRENGTH) for k in (1, 0))
     top = rows.max(axis=1)
     rows, before, weights = np.exp(rows - top[:, None]), np.exp(before), np.full(len(CENTRES), 1.0 / len(CENTRES))
-    for _ in range(ROUNDS):
+    for _ in range(EM_STEPS):
         after, given = rows @ weights, before @ weights
         slab = _with_spike(np.log(after / given) + top, certain, n, e, prior_mean)[1]
-        weights *= ((slab / after) @ rows) / np.maximum((slab / given) @ before, LEAST)
-        weights = np.maximum(weights / weights.sum(), LEAST)
-        certain = float(1.0 - slab.mean().clip(LEAST, 1.0 - LEAST))
+        weights *= ((slab / after) @ rows) / np.maximum((slab / given) @ before, LEAST_RATE)
+        weights = np.maximum(weights / weights.sum(), LEAST_RATE)
+        certain = float(1.0 - slab.mean().clip(LEAST_RATE, 1.0 - LEAST_RATE))
     return MixedPrior(certain, MIXED_STRENGTH, weights / weights.sum())
 
 

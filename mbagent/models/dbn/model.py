@@ -17,7 +17,7 @@ from mbagent.models.dbn.arrays import Graphs, build, n_features
 from mbagent.models.dbn.change_points import last_changes
 from mbagent.models.dbn.effects import EffectModel, Operand, best_effect_models, candidates, likely_operands, more_folds
 from mbagent.models.dbn.features import Layout, action_encoding, is_lone_bit, layout_with_mutexes, make_layout
-from mbagent.models.dbn.fitting import AT_ONCE, Fitted, fit_graphs, flag_resets, no_synchronic
+from mbagent.models.dbn.fitting import ROWS_AT_ONCE, Fitted, fit_graphs, flag_resets, no_synchronic
 from mbagent.models.dbn.mutex import find_groups
 from mbagent.models.dbn.predictions import GraphPredictions
 from mbagent.models.dbn.serialization import SAVED, from_arrays, table_of, to_arrays
@@ -79,26 +79,26 @@ def flat_variables(layout: Layout, graphs: Graphs, synchronic: Graphs) -> list[V
     return found
 
 
-IMPOSSIBLE = -200.0
+IMPOSSIBLE_LOG_PROB = -200.0
 """Log-probability that an impossible transition is charged with when models are compared."""
 
-FEWEST = 4
+FEWEST_RESETS = 4
 """Rare events that there must be to learn anything of them."""
 
-ENOUGH, MOST_SPLITS = 5, 10
+ENOUGH_RESETS, MOST_FOLDS = 5, 10
 """So many held-out rare events tell whether they are events at all; where one split has fewer, others follow, up to so many."""
 
 MOST_VALUES = 200_000_000
 """Values of factors that are learned from at once, which takes up to some ten bytes each; of more transitions than have so
 many, evenly chosen ones are."""
 
-MOST_COUNTS = 20_000_000
+MOST_EFFECT_COUNTS = 20_000_000
 """Contexts times columns of a question about how far a factor moves."""
 
 DESCRIBED = 2000
 """Held-out transitions that figures of single variables are made from."""
 
-WORTH = 0.03
+WORTH_TELLING = 0.03
 """What the past tells is worth telling beyond this share of what cannot be foretold, plus one nat."""
 
 
@@ -231,7 +231,7 @@ class DecisionGraphModel(GraphPredictions):
         _, longer_tests = with_past(*tests, self.cardinalities, self.encoding, self._planes())
         further = self._with_memory(space)._quick_log_probs(longer, longer_tests)
         gain = float((further - logs).mean())
-        return gain if better(further, logs) and gain > WORTH * (1.0 - logs.mean()) else 0.0
+        return gain if better(further, logs) and gain > WORTH_TELLING * (1.0 - logs.mean()) else 0.0
 
     def _planes(self) -> PlaneLayout | None:
         return None
@@ -245,7 +245,7 @@ class DecisionGraphModel(GraphPredictions):
         self._look(train)
         logs = self.log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
         self._restore(before)
-        return np.maximum(logs, IMPOSSIBLE)
+        return np.maximum(logs, IMPOSSIBLE_LOG_PROB)
 
     def _look(self, rows: TransitionBatch) -> None:
         """Learns quickly."""
@@ -284,7 +284,7 @@ class DecisionGraphModel(GraphPredictions):
         """Which rows are rare events; none if held-out transitions are foretold better without."""
         rows = data.rows()
         resets, gain, tested = flag_resets(rows.before, rows.after), 0.0, 0
-        for split in range(MOST_SPLITS if resets.sum() >= FEWEST else 0):
+        for split in range(MOST_FOLDS if resets.sum() >= FEWEST_RESETS else 0):
             train, held_out = data.split(self.validation, seed + split)
             observed = flag_resets(train.before, train.after)
             with_resets, without = (
@@ -293,7 +293,7 @@ class DecisionGraphModel(GraphPredictions):
             )
             gain += (with_resets - without) * len(held_out)
             tested += int(flag_resets(held_out.before, held_out.after).sum())
-            if tested >= ENOUGH:
+            if tested >= ENOUGH_RESETS:
                 break
         return resets & (gain > 0.0)
 
@@ -301,7 +301,7 @@ class DecisionGraphModel(GraphPredictions):
         """How each factor is asked about: as its held-out values are foretold best."""
         n_contexts, n_features = self.encoding.n_action_classes * max(self.cardinalities, default=0), 2 * sum(self.cardinalities)
         every = [f for f, cardinality in enumerate(self.cardinalities) if cardinality > 2]
-        if not every or n_contexts * n_features > MOST_COUNTS or len(held_out) == 0:
+        if not every or n_contexts * n_features > MOST_EFFECT_COUNTS or len(held_out) == 0:
             return {}
         folds = [(train, resets, held_out)]
         folds += [(train.select(~out), resets[~out], train.select(out)) for out in more_folds(train, held_out)]
@@ -327,15 +327,15 @@ class DecisionGraphModel(GraphPredictions):
         return logs
 
     def _likelihood(self, fitted: Fitted, rows: TransitionBatch) -> float:
-        """Mean log-probability of transitions; the impossible counts as ``IMPOSSIBLE``."""
+        """Mean log-probability of transitions; the impossible counts as ``IMPOSSIBLE_LOG_PROB``."""
         before, self.fitted = self.fitted, fitted
-        parts = [self.log_prob(p.states, p.actions, p.next_states, p.terminated) for p in rows.parts(AT_ONCE)]
+        parts = [self.log_prob(p.states, p.actions, p.next_states, p.terminated) for p in rows.parts(ROWS_AT_ONCE)]
         self.fitted, logs = before, np.concatenate([np.zeros(0), *parts])
-        return float(np.maximum(logs, IMPOSSIBLE).mean()) if len(logs) else 0.0
+        return float(np.maximum(logs, IMPOSSIBLE_LOG_PROB).mean()) if len(logs) else 0.0
 
     def _exact_match(self, rows: TransitionBatch) -> float:
         hits = 0
-        for part in rows.parts(AT_ONCE):
+        for part in rows.parts(ROWS_AT_ONCE):
             states, terminated = self.likeliest(part.states, part.actions)
             hits += int(((states == part.after).all(axis=1) & (terminated == part.terminated)).sum())
         return hits / len(rows) if len(rows) else 1.0

@@ -23,7 +23,7 @@ from mbagent_envs.jit import compiled
 EXPECTED = 8.0
 """Two bits must have been expected together this often before "never" is believed: else it may be chance, one in 3,000."""
 
-MOST_ROWS = 50_000
+MOST_CANDIDATE_ROWS = 50_000
 """Rows that candidates are looked for in; what is found is checked on all."""
 
 
@@ -47,7 +47,7 @@ def find_groups(
     bits = np.flatnonzero(np.asarray(cardinalities) == 2)
     if len(bits) < 3 or len(states) == 0:
         return ()
-    some = np.linspace(0, len(states) - 1, min(len(states), MOST_ROWS)).astype(np.int64)
+    some = np.linspace(0, len(states) - 1, min(len(states), MOST_CANDIDATE_ROWS)).astype(np.int64)
     before, after = states[some][:, bits] == 1, next_states[some][:, bits] == 1
     kept = slice(None) if usual is None else usual[some]
     positives, went = (after & ~before)[kept].astype(np.float32), (before & ~after)[kept].astype(np.float32)

@@ -18,7 +18,7 @@ from mbagent.models.dbn.features import BEYOND, action_features
 from mbagent.types import Bools, Ints
 from mbagent_envs.jit import compiled
 
-_T = TypeVar("_T", bound=np.generic)
+_Cell = TypeVar("_Cell", bound=np.generic)
 
 CELL, BORDER, ACTION, ADJACENCY, NEXT, WRAP, NEXT_ADJACENCY = 0, 1, 2, 3, 4, 5, 6
 """Kinds of relative columns, and what follows the kind:
@@ -201,11 +201,11 @@ def values_at(features: Ints, planes: Factors, actions: Ints, rows: Ints, y: Int
     order = np.argsort(rows, kind="stable")
     for begin in range(0, len(rows), PIECE):
         some = order[begin : begin + PIECE]
-        met, where = np.unique(rows[some], return_inverse=True)
-        wide, part = planes[met].astype(np.int64), np.zeros((len(some), len(features)), dtype=np.bool_)
+        observed, where = np.unique(rows[some], return_inverse=True)
+        wide, part = planes[observed].astype(np.int64), np.zeros((len(some), len(features)), dtype=np.bool_)
         _look_around(features, wide, where, y[some], x[some], part)
         for d in np.flatnonzero(np.isin(features[:, 0], (ACTION, ADJACENCY))):
-            part[:, d] = far_value(features[d], wide, actions[met], None)[where]
+            part[:, d] = far_value(features[d], wide, actions[observed], None)[where]
         table[some] = part
     return table
 
@@ -248,7 +248,7 @@ def far_value(feature: Ints, planes: Factors, actions: Ints, after: Factors | No
     return _action_is(feature, actions) if kind == ACTION else are_adjacent(_shown(kind, planes, after), feature[1:])
 
 
-def shifted(plane: NDArray[_T], below: int, right: int) -> NDArray[_T]:
+def shifted(plane: NDArray[_Cell], below: int, right: int) -> NDArray[_Cell]:
     """What lies so many rows below and columns to the right of each position of [N, H, W]; 0 beyond the border."""
     _, height, width = plane.shape
     result = np.zeros_like(plane)
@@ -259,7 +259,7 @@ def shifted(plane: NDArray[_T], below: int, right: int) -> NDArray[_T]:
     return result
 
 
-def wrapped(plane: NDArray[_T], below: int, right: int) -> NDArray[_T]:
+def wrapped(plane: NDArray[_Cell], below: int, right: int) -> NDArray[_Cell]:
     """What lies beyond the border so far from each position of [N, H, W], and so at the other end; 0 where nothing is beyond."""
     around = np.roll(plane, (-below, -right), axis=(1, 2))
     inside = shifted(np.ones((1, *plane.shape[1:]), dtype=np.bool_), below, right)

@@ -24,7 +24,7 @@ from mbagent.models.dbn.fitting import UNCERTAIN, Fitted, fit_graphs, go_togethe
 from mbagent.models.dbn.grounding import COLUMN, ROW, WHOLE, LocalGraphs, Mutex, instantiate, with_invariants, with_mutexes
 from mbagent.models.dbn.invariants import NO_INVARIANTS, Invariants, all_kept, find_invariants, n_combinations
 from mbagent.models.dbn.large_data import PlaneTable, channel_layout, refine
-from mbagent.models.dbn.model import IMPOSSIBLE, DecisionGraphModel, depends_on_action, tested_features
+from mbagent.models.dbn.model import IMPOSSIBLE_LOG_PROB, DecisionGraphModel, depends_on_action, tested_features
 from mbagent.models.dbn.plane_features import (
     NEXT,
     NEXT_ADJACENCY,
@@ -42,7 +42,7 @@ from mbagent.models.held_out import FORETOLD, SOME_ROWS, SOME_TESTS, better, thi
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.types import Bools, Floats, Ints
 
-TOGETHER = 12.0
+EXPECTED_TOGETHER = 12.0
 """Two bits of a set must have been expected together this often before "never" is believed of them."""
 
 SOME_CELLS = 100_000
@@ -191,7 +191,7 @@ def find_mutexes(
             total, squares = p.sum(axis=axis).reshape(len(p), -1), (p**2).sum(axis=axis).reshape(len(p), -1)
             expected = (total**2 - squares).sum(axis=0) / 2.0 * (len(rows) / max(len(some), 1))
             alone = after[:, channel].sum(axis=axis, dtype=np.int64).reshape(len(rows), -1).max(axis=0, initial=0) <= 1
-            for i in np.flatnonzero(alone & (expected > TOGETHER)):
+            for i in np.flatnonzero(alone & (expected > EXPECTED_TOGETHER)):
                 line = int(i) if i < (length + 1) // 2 else int(i) - length
                 found.append((float(expected[i]), Mutex(channel, kind, line, False)))
     found.sort(key=lambda entry: -entry[0])
@@ -366,14 +366,14 @@ class LocalGraphModel(DecisionGraphModel):
             np.random.default_rng(0),
         )
         each = [*(NO_INVARIANTS._replace(counts=invariants.counts[k : k + 1]) for k in range(len(invariants.counts)))]
-        each += [NO_INVARIANTS._replace(met=invariants.met)]
+        each += [NO_INVARIANTS._replace(observed=invariants.observed)]
         broken, states = np.zeros(len(each), dtype=np.bool_), thinned(rows, SOME_ROWS).states
         for _ in range(0 if invariants.none else SIMULATED_STEPS):
             following, over = self.sample(states, rng.integers(self.n_actions, size=len(states)), rng)
             for i, invariant in enumerate(each):
                 broken[i] |= not (over | all_kept(*invariant, layout.weights, layout.cells, states, following)).all()
             states = following[~over]
-        invariants = Invariants(invariants.counts[broken[:-1]], invariants.met if broken[-1] else NO_INVARIANTS.met)
+        invariants = Invariants(invariants.counts[broken[:-1]], invariants.observed if broken[-1] else NO_INVARIANTS.observed)
         self.local = replace(self.local, invariants=invariants)
         self.fitted = replace(self.fitted, layout=with_invariants(layout, invariants))
 
@@ -408,7 +408,7 @@ class LocalGraphModel(DecisionGraphModel):
         """See TransitionModel."""
         mutexes = np.asarray(self.local.mutexes, dtype=np.int64).reshape(-1, 4)
         state: dict[str, NDArray[Any]] = {"reach": np.asarray(self.reach, dtype=np.int64), "couplings": mutexes}
-        state |= self.local.invariants._asdict()
+        state |= {"counts": self.local.invariants.counts, "met": self.local.invariants.observed}
         for name, graphs in (("local", self.local.graphs), ("late", self.local.synchronic)):
             state.update({f"{name}.{part}": array for part, array in to_arrays(graphs).items()})
         return state
@@ -447,7 +447,7 @@ class LocalGraphModel(DecisionGraphModel):
             raise ValueError("These weights couple cells that these planes do not have; load them into a model of the same kind.")
         invariants = Invariants(table_of(state["counts"], 2), np.array(state["met"], dtype=np.bool_).reshape(-1))
         if any(c not in range(len(cards)) or value not in range(cards[c]) for c, value in invariants.counts) or (
-            len(invariants.met) not in (0, n_combinations(cards))
+            len(invariants.observed) not in (0, n_combinations(cards))
         ):
             raise ValueError("These weights count values that these planes do not have; load them into a model of the same kind.")
         self.local, self.reach = LocalGraphs(graphs, synchronic, features, cards, self.encoding, mutexes, invariants), reach
@@ -471,7 +471,7 @@ def _sound(graphs: Graphs, synchronic: Graphs, features: Ints) -> bool:
     )
 
 
-MOST_CELLS = 2000
+MOST_UNTIED_CELLS = 2000
 """Cells of planes of which each is looked at for itself; with more, no rows would be enough."""
 
 
@@ -519,12 +519,12 @@ class PlaneGraphModel(LocalGraphModel):
             loss: what held-out transitions cost the model of all positions, nats each; None where none was held out.
         """
         some, tests = thinned(train, SOME_ROWS), thinned(held_out, SOME_TESTS)
-        if loss is None or loss < -FORETOLD or len(self.cardinalities) > MOST_CELLS or min(len(some), len(tests)) < 2:
+        if loss is None or loss < -FORETOLD or len(self.cardinalities) > MOST_UNTIED_CELLS or min(len(some), len(tests)) < 2:
             return False
         flat = DecisionGraphModel(self.cardinalities, self.n_actions, parts=self.parts)
         flat.fitted = fit_graphs(self.cardinalities, self.encoding, some, np.zeros(len(some), dtype=np.bool_), False, False)
         logs = flat.log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
-        return better(np.maximum(logs, IMPOSSIBLE), np.full(len(logs), -loss))
+        return better(np.maximum(logs, IMPOSSIBLE_LOG_PROB), np.full(len(logs), -loss))
 
     def for_space(self, space: FactoredSpace | spaces.Space[Any]) -> LocalGraphModel:
         """See LocalGraphModel.

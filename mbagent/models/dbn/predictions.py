@@ -47,7 +47,7 @@ class GraphPredictions(BaseTransitionModel):
 
     @property
     def _invariants(self) -> Invariants:
-        return Invariants(self.fitted.layout.counts, self.fitted.layout.met)
+        return Invariants(self.fitted.layout.counts, self.fitted.layout.observed)
 
     @property
     def _cells(self) -> tuple[Ints, Ints]:

@@ -33,9 +33,9 @@ from mbagent.types import Bools, Floats, Ints
 from mbagent_envs.jit import compiled, inlined
 
 SHOWN, NEXT_SHOWN, ACTION_PART, MEETS, NEXT_MEETS = range(5)
-"""Kinds of columns: a factor's value lies from one to another, now or next; an action has it; see ``features.Layout.adjacencies``."""
+"""Kinds of features: a factor's value lies in a range, now or next; an action has it; see ``features.Layout.adjacencies``."""
 
-MOST_ENTRIES = 50_000_000
+MOST_REWARD_ENTRIES = 50_000_000
 """Rows times columns that are searched; of more rows, all of rare classes and evenly chosen others are, up to half each."""
 
 MOST_SINGLE = 4000
@@ -84,7 +84,7 @@ def fit_classes(
     """
     encoding, layout = action_encoding(parts), make_layout(cardinalities, (), action_encoding(parts), ordinal=planes is None)
     candidates = _candidates(rows, layout, cardinalities, parts, planes)
-    chosen = _chosen(classes, max(1, MOST_ENTRIES // max(len(candidates), 1)))
+    chosen = _chosen(classes, max(1, MOST_REWARD_ENTRIES // max(len(candidates), 1)))
     some, kinds = rows.select(chosen), _kinds(rows, layout, candidates)
     first, pattern = distinct(np.packbits(_values(some, layout, candidates, planes), axis=1), some.actions)
     table = _values(some.select(first), layout, candidates, planes)
@@ -195,8 +195,10 @@ def _counted(graphs: ClassGraphs, rows: TransitionBatch, classes: Ints) -> Float
     for j, k in enumerate(graphs.classes):
         parts = [leaves_of(graphs, j, part.states, part.actions, part.next_states) for part in rows.parts(10_000)]
         leaves = np.concatenate(parts)
-        met = leaves >= 0
-        n, e = (np.bincount(leaves[met], weights=which[met], minlength=len(rates)) for which in (classes >= 0, classes == k))
+        observed = leaves >= 0
+        n, e = (
+            np.bincount(leaves[observed], weights=which[observed], minlength=len(rates)) for which in (classes >= 0, classes == k)
+        )
         rates = np.where(n > 0, e / np.maximum(n, 1), rates)
     return rates
 

@@ -1,8 +1,9 @@
-"""Drawing from decision graphs, compiled: next states and probabilities.
+"""Sampling from decision graphs, compiled: next states and probabilities.
 
-Units that ``synchronic`` has graphs of are drawn after all others, given what those became (the paper's conditioner, section 3.2);
-only in rows where they are uncertain by themselves, but for whether the episode ended. Shapes: B batch, F factors, U units
-(the last two are ``terminated`` and the event), Q couplings, D columns, D' of them the state's.
+Variables with synchronic arcs (graphs in ``synchronic``) are drawn after all others, given the values drawn so far (the
+paper's conditioner, section 3.2), but only in rows where they are uncertain by themselves; ``terminated`` always is.
+Shapes: B batch, F factors, U variables (the last two are ``terminated`` and the reset), Q mutex groups, D features, D' of them
+of single factors.
 """
 
 from __future__ import annotations

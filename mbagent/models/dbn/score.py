@@ -19,7 +19,7 @@ from mbagent_envs.jit import compiled
 
 Tables: TypeAlias = tuple[Floats, Floats, Floats]
 
-ALL, ACTION, VALUE, SINGLE = 0, 1, 2, 3
+BY_ALL, BY_ACTION, BY_VALUE, BY_CONTEXT = 0, 1, 2, 3
 """Contexts that a split may pool: all, those of one action, those of one present value, or a single one."""
 
 STRENGTH = 0.2
@@ -65,7 +65,7 @@ class Chosen(NamedTuple):
 
     Attributes:
         gain: evidence beyond its price; 0 where no split has any.
-        kind: ALL, ACTION, VALUE or SINGLE.
+        kind: BY_ALL, BY_ACTION, BY_VALUE or BY_CONTEXT.
         which: the action, the value or the context.
         feature: what the rows are told apart by.
     """
@@ -218,7 +218,7 @@ def best_split(target: Target, tally: Tally, prior: Floats, narrow: Floats, tabl
                 outside[s] += others
             gain = those + others + prior[b] + narrow[2]
             if gain > best and on[c, b] < n[c]:
-                best, kind, which, chosen = gain, SINGLE, c, b
+                best, kind, which, chosen = gain, BY_CONTEXT, c, b
         for s in range(n_sets - 1):
             if set_n[s] == 0 or set_n[s] == sets.n[s]:
                 continue
@@ -226,7 +226,7 @@ def best_split(target: Target, tally: Tally, prior: Floats, narrow: Floats, tabl
             gain += max(outside[s], evidence(sets.e[s] - set_e[s], sets.n[s] - set_n[s], one, two, alike))
             gain += 0.0 if s == 0 else narrow[0] if s <= sets.n_actions else narrow[1]
             if gain > best:
-                kind = ALL if s == 0 else ACTION if s <= sets.n_actions else VALUE
+                kind = BY_ALL if s == 0 else BY_ACTION if s <= sets.n_actions else BY_VALUE
                 best, chosen = gain, b
                 which = 0 if s == 0 else s - 1 if s <= sets.n_actions else s - 1 - sets.n_actions
     return Chosen(best, kind, which, chosen)

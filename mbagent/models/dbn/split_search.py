@@ -38,13 +38,13 @@ PATTERNS: tuple[tuple[bool, bool, bool, bool], ...] = (
 )
 """Which of the cells (neither, second only, first only, both) are told apart from the others."""
 
-FEWEST = 20
+FEWEST_PAIR_ROWS = 20
 """Rows that a context must have."""
 
-FIRST = 3.0
+FIRST_THRESHOLD = 3.0
 """Log prior odds against one more cause, before any was found."""
 
-LEAST = 1.0
+LEAST_GAIN = 1.0
 """Least price of a cause, nats, however likely the prior makes it."""
 
 MOST_WORK = 5_000_000_000
@@ -57,10 +57,10 @@ MOST_CONTEXTS = 4
 """Contexts of a head that pairs are looked for in, the most mixed ones."""
 
 
-MOST_FEATURES = 500
+MOST_PAIRED_FEATURES = 500
 """Columns that pairs are made of; of more, those that tell most by themselves."""
 
-EXACT = 2**24
+EXACT_FLOATS = 2**24
 """Sums up to here are exact in single precision."""
 
 SPARSE = 16.0
@@ -116,7 +116,7 @@ class PairSearch:
         """Log prior odds of each pair of columns, [D, D]: pairs of a kind already found are likelier, of fresh columns most."""
         n = len(self.kinds)
         if len(self._found) < TELLING:
-            return np.full((n, n), -math.log(max(1.0, n * (n - 1) / 2)) - FIRST)
+            return np.full((n, n), -math.log(max(1.0, n * (n - 1) / 2)) - FIRST_THRESHOLD)
         n_kinds = int(self.kinds.max()) + 1
         share, used = np.full((n_kinds, n_kinds), 0.2 / n_kinds**2), np.zeros(n, dtype=np.bool_)
         for pair in self._found:
@@ -127,7 +127,7 @@ class PairSearch:
         fresh = np.bincount(self.kinds[~used], minlength=n_kinds).clip(1)
         # Where some columns of one kind each had a partner of another kind, the next one has, too: only who it is has a price.
         odds = np.log(share / share.sum() / np.maximum.outer(fresh, fresh))[self.kinds[:, None], self.kinds]
-        result: Floats = odds - LEAST - np.where(used[:, None] | used, 3.0, 0.0)
+        result: Floats = odds - LEAST_GAIN - np.where(used[:, None] | used, 3.0, 0.0)
         return result
 
 
@@ -147,7 +147,10 @@ def find_pairs(
     found: list[Pair] = []
     for context in contexts:
         rows = target.context == context
-        if target.counts[rows].sum() >= FEWEST and rows.sum() * min(table.shape[1], MOST_FEATURES) ** 2 < MOST_WORK:
+        if (
+            target.counts[rows].sum() >= FEWEST_PAIR_ROWS
+            and rows.sum() * min(table.shape[1], MOST_PAIRED_FEATURES) ** 2 < MOST_WORK
+        ):
             here, counts, positives = table[target.rows[rows]], target.counts[rows], target.positives[rows]
             kept = _telling_most(here, counts, positives, tables)
             pairs = _in_context(context, here[:, kept], counts, positives, prior[np.ix_(kept, kept)], patterns, tables)
@@ -159,12 +162,12 @@ def find_pairs(
 def _telling_most(table: Bools, counts: Ints, positives: Ints, tables: Tables) -> Ints:
     """Numbers of the columns that pairs are made of, ascending: all of them, or those that tell most by themselves."""
     n_features = table.shape[1]
-    if n_features <= MOST_FEATURES:
+    if n_features <= MOST_PAIRED_FEATURES:
         return np.arange(n_features)
     on = table.T.astype(np.float64)
     n, e = (np.rint(on @ weights).astype(np.int64) for weights in (counts, positives))
     gain = evidences(e, n, tables) + evidences(positives.sum() - e, counts.sum() - n, tables)
-    return np.sort(np.argsort(-gain, kind="stable")[:MOST_FEATURES])
+    return np.sort(np.argsort(-gain, kind="stable")[:MOST_PAIRED_FEATURES])
 
 
 def _in_context(
@@ -193,7 +196,7 @@ def _both(on: Bools, weights: Ints) -> Ints:
         first = np.concatenate([[0], np.cumsum(per_row)]).astype(np.int64)
         result: Ints = _count_both(first, np.nonzero(on)[1], weights, on.shape[1])
         return result
-    exact = np.float32 if weights.sum() < EXACT else np.float64
+    exact = np.float32 if weights.sum() < EXACT_FLOATS else np.float64
     wide = on.astype(exact)
     product: Ints = np.rint((wide * weights[:, None].astype(exact)).T @ wide).astype(np.int64)
     return product
@@ -246,7 +249,7 @@ def _best_patterns(
 SUREST = 0.99
 """A rate is believed to be 0 or 1 beforehand with this probability at most."""
 
-MOST_SPLITS = 256
+MOST_SPLITS_A_GRAPH = 256
 """Most splits of one head."""
 
 
@@ -293,7 +296,7 @@ def go_on(
         while found := _next_splits(searches, features, kinds, n_actions, tables):
             for h, chosen in found:
                 searches[h].divide(chosen, table, tables)
-                searches[h].open = len(searches[h].splits) < MOST_SPLITS
+                searches[h].open = len(searches[h].splits) < MOST_SPLITS_A_GRAPH
         going = in_pairs and pairs.divide(searches)
 
 
@@ -308,8 +311,8 @@ def _next_splits(
     for h, search in enumerate(searches):
         if search.open:
             more = ((counts > counts[h]).sum() + 0.5) / ((counts >= counts[h]).sum() + 1.0)
-            odds = math.log(more / (1.0 - more)) if learned else -FIRST
-            chosen = best_split(search.target, search.tally(features), np.minimum(prior + odds, -LEAST), narrow, tables)
+            odds = math.log(more / (1.0 - more)) if learned else -FIRST_THRESHOLD
+            chosen = best_split(search.target, search.tally(features), np.minimum(prior + odds, -LEAST_GAIN), narrow, tables)
             if chosen.gain > 0.0:
                 found.append((h, chosen))
     found.sort(key=lambda entry: -entry[1].gain)

@@ -7,7 +7,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mbagent.models.dbn.score import ACTION, ALL, SINGLE, VALUE, Chosen, FeatureBlocks, Tables, Tally, Target, count, evidences
+from mbagent.models.dbn.score import (
+    BY_ACTION,
+    BY_ALL,
+    BY_CONTEXT,
+    BY_VALUE,
+    Chosen,
+    FeatureBlocks,
+    Tables,
+    Tally,
+    Target,
+    count,
+    evidences,
+)
 from mbagent.types import Bools, Floats, Ints
 
 MOST_KEPT = 100_000
@@ -153,9 +165,9 @@ class Search:
     def _covered(self, chosen: Chosen) -> Bools:
         """Which contexts a split is about, bool [C]."""
         target = self.target
-        if chosen.kind == ALL:
+        if chosen.kind == BY_ALL:
             return np.ones(len(target.action), dtype=np.bool_)
-        labels = {ACTION: target.action, VALUE: target.value, SINGLE: np.arange(len(target.action))}[chosen.kind]
+        labels = {BY_ACTION: target.action, BY_VALUE: target.value, BY_CONTEXT: np.arange(len(target.action))}[chosen.kind]
         covered: Bools = labels == chosen.which
         return covered
 

@@ -307,7 +307,7 @@ def whole_outcomes(
             found = successors(states[:1], actions[a : a + 1], layout, kernel.reset, kernel.reset_synchronic, grid)
             n += _take(found[1], found[2], found[3], rate, total + n, out)
             out.left_out[action] += rate * found[4][0]
-        if len(layout.counts) or len(layout.met):
+        if len(layout.counts) or len(layout.observed):
             n = _leave_out(layout, state, total, n, out)
         out.counts[action] = n
         total += n
@@ -317,8 +317,8 @@ def whole_outcomes(
 @compiled
 def _leave_out(layout: Layout, state: Ints, first: int, n: int, out: Outcomes) -> int:
     """Takes what breaks a law out of the last ``n`` outcomes; returns how many are left."""
-    counts, met, weights, cells = layout.counts, layout.met, layout.weights, layout.cells
-    return leave_out(counts, met, weights, cells, state, out.states, out.terminated, out.probabilities, first, n)
+    counts, observed, weights, cells = layout.counts, layout.observed, layout.weights, layout.cells
+    return leave_out(counts, observed, weights, cells, state, out.states, out.terminated, out.probabilities, first, n)
 
 
 @compiled

@@ -34,14 +34,14 @@ from mbagent.models.systematic_sampling import (
 from mbagent.types import Ints
 from mbagent_envs.jit import compiled, inlined
 
-LANES = 16
+BIT_LANES = 16
 """Columns are filled up to a multiple of this many numbers, which a processor adds at once."""
 
-_LOG2E, _LN2_HIGH, _LN2_LOW = np.float32(1.44269504), np.float32(0.693359375), np.float32(-2.12194440e-4)
+_LOG2E, _BIT_LN2_HIGH, _BIT_LN2_LOW = np.float32(1.44269504), np.float32(0.693359375), np.float32(-2.12194440e-4)
 _ROUND = np.float32(12582912.0)  # 1.5 * 2**23: a small number added to it is rounded to a whole one
 _C5, _C4, _C3 = np.float32(1.9875691500e-4), np.float32(1.3981999507e-3), np.float32(8.3334519073e-3)
 _C2, _C1, _C0 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1), np.float32(5.0000001201e-1)
-_ONE, _TWO, _MOST = np.float32(1.0), np.float32(2.0), np.float32(80.0)
+_BIT_ONE, _BIT_TWO, _MOST = np.float32(1.0), np.float32(2.0), np.float32(80.0)
 
 
 class CausalBits(NamedTuple):
@@ -88,7 +88,7 @@ def pack_bits(dense: DenseWeights, group: GroupWeights, layout: Layout, certain:
     if (layout.outputs != 2).any() or len(dense.sizes) != 1 or layout.n_steps != 1:
         return None
     n_outputs = len(layout.outputs)
-    more = -n_outputs % LANES
+    more = -n_outputs % BIT_LANES
     p = min(max(certain, 0.5), 1.0)
     return CausalBits(
         first=dense.first,
@@ -113,16 +113,16 @@ def _exp(x: np.float32) -> np.float32:
     """exp(x) for -80 <= x <= 80, so written that a loop over it takes many numbers at once (Moshier's Cephes, expf)."""
     shifted = x * _LOG2E + _ROUND
     whole = shifted - _ROUND
-    rest = x - whole * _LN2_HIGH - whole * _LN2_LOW
+    rest = x - whole * _BIT_LN2_HIGH - whole * _BIT_LN2_LOW
     tail = ((((_C5 * rest + _C4) * rest + _C3) * rest + _C2) * rest + _C1) * rest + _C0
     power = np.int32((np.int32(whole) + 127) << 23)
-    return (tail * rest * rest + rest + _ONE) * power.view(np.float32)
+    return (tail * rest * rest + rest + _BIT_ONE) * power.view(np.float32)
 
 
 @inlined
 def _gate(x: np.float32) -> np.float32:
     """The logistic function. ``np.divide`` asks for no error at 0, which would keep a loop from taking many numbers at once."""
-    gate: np.float32 = np.divide(_ONE, _ONE + _exp(min(max(-x, -_MOST), _MOST)))
+    gate: np.float32 = np.divide(_BIT_ONE, _BIT_ONE + _exp(min(max(-x, -_MOST), _MOST)))
     return gate
 
 
@@ -134,7 +134,7 @@ def activate(values: Floats32, code: int) -> None:
             values[h] = max(values[h], np.float32(0.0))
     elif code == TANH:
         for h in range(len(values)):
-            values[h] = _TWO * _gate(_TWO * values[h]) - _ONE
+            values[h] = _BIT_TWO * _gate(_BIT_TWO * values[h]) - _BIT_ONE
     elif code == SIGMOID:
         for h in range(len(values)):
             values[h] = _gate(values[h])
@@ -164,7 +164,7 @@ def predict(
     for c in range(len(logits)):
         logits[c] = last_bias[c] - stay[action, c]
     for bit in on:
-        logits[bit] += _TWO * stay[action, bit]
+        logits[bit] += _BIT_TWO * stay[action, bit]
     h = 0
     while h + 4 <= len(hidden):
         v0, v1, v2, v3 = hidden[h], hidden[h + 1], hidden[h + 2], hidden[h + 3]
@@ -241,7 +241,7 @@ def condition(
     return logit + np.float64(offsets[g] + ((s0 + s1) + (s2 + s3)))
 
 
-SETTLED = math.log(1.0 / NEGLIGIBLE)
+CERTAIN_LOGIT = math.log(1.0 / NEGLIGIBLE)
 """A bit whose logit is further from 0 has only one value worth drawing."""
 
 
@@ -302,9 +302,9 @@ def bits_work(k: CausalBits, n_grid: int) -> BitsWork:
 @inlined
 def _chance(logit: float) -> float:
     """Probability of a bit, pruned as ``particles.prune`` does."""
-    if logit > SETTLED:
+    if logit > CERTAIN_LOGIT:
         return 1.0
-    if logit < -SETTLED:
+    if logit < -CERTAIN_LOGIT:
         return 0.0
     return 1.0 / (1.0 + math.exp(-logit))
 
@@ -325,7 +325,7 @@ def _settle(logits: Floats32, group_of: Ints, certain: float, base: Ints, still_
     n_open, n_shown = 0, 0
     for i in range(len(base)):
         distance = abs(np.float64(logits[i]))
-        if distance > SETTLED and (group_of[i] < 0 or distance >= certain):
+        if distance > CERTAIN_LOGIT and (group_of[i] < 0 or distance >= certain):
             base[i] = int(logits[i] > 0.0)
             if logits[i] > 0.0:
                 shown[n_shown] = i

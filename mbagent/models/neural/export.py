@@ -17,7 +17,7 @@ from mbagent.types import Actions, States
 CompiledBody: TypeAlias = Callable[[States, Actions], Floats32]
 """(states int64 [B, F], actions int64 [B]) -> logits float32 [B, O, K]; a row's result does not depend on its batch."""
 
-CHUNK = 64
+ROWS_PER_CHUNK = 64
 """Rows that other torch bodies are evaluated on at once, always this many: matrix products round differently in
 other sizes."""
 
@@ -39,13 +39,13 @@ def compiled_body(predictor: nn.Module, layout: Layout) -> CompiledBody:
 
 @torch.inference_mode()
 def in_chunks(predictor: nn.Module, states: States, actions: Actions) -> Floats32:
-    """Logits float32 [B, O, K] of a torch body, evaluated ``CHUNK`` rows at a time, the last rows filled up with zeros."""
+    """Logits float32 [B, O, K] of a torch body, in chunks of ``ROWS_PER_CHUNK`` rows, the last one padded with zeros."""
     parts = []
-    for start in range(0, max(len(states), 1), CHUNK):
-        rows = slice(start, min(start + CHUNK, len(states)))
+    for start in range(0, max(len(states), 1), ROWS_PER_CHUNK):
+        rows = slice(start, min(start + ROWS_PER_CHUNK, len(states)))
         n = rows.stop - rows.start
-        chunk_states = np.zeros((CHUNK, states.shape[1]), dtype=np.int64)
-        chunk_actions = np.zeros(CHUNK, dtype=np.int64)
+        chunk_states = np.zeros((ROWS_PER_CHUNK, states.shape[1]), dtype=np.int64)
+        chunk_actions = np.zeros(ROWS_PER_CHUNK, dtype=np.int64)
         chunk_states[:n], chunk_actions[:n] = states[rows], actions[rows]
         parts.append(predictor(torch.from_numpy(chunk_states), torch.from_numpy(chunk_actions)).numpy()[:n])
     return np.concatenate(parts).astype(np.float32, copy=False)

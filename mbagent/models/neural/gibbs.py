@@ -30,10 +30,10 @@ from mbagent_envs.random_keys import derive_one, fill_row
 LEEWAY = 2.0
 """The conditioner is taken to raise the odds of an unlikely value of a trusted factor at most so many times."""
 
-ROWS = 64
+GIBBS_ROWS = 64
 """Rows that are worked on together, at most."""
 
-SUMS = 2**15
+MOST_SUMS = 2**15
 """Numbers in the summed inputs of all open factors of these rows, at most: more would not stay in the processor's cache."""
 
 ALWAYS = 2.0
@@ -73,7 +73,7 @@ class SweepWork(NamedTuple):
         columns: all columns that are on now, int64 [C + O + n_steps].
         shift: from a column to its place among a group's, by whether it is on in the state and in the next one, int64 [4].
         chosen: factors that this sweep may change, int64 [O].
-        luck: a number for each factor, [O].
+        noise: a number for each factor, [O].
         rank: another one, which orders them, [O].
         ranks: that of the chosen ones, [O].
         order: the chosen ones in that order, int64 [O].
@@ -87,7 +87,7 @@ class SweepWork(NamedTuple):
     columns: Ints
     shift: Ints
     chosen: Ints
-    luck: Floats
+    noise: Floats
     rank: Floats
     ranks: Floats
     order: Ints
@@ -100,8 +100,8 @@ class SweepWork(NamedTuple):
 def work_space(n_rows: int, layout: Layout, group: GroupWeights) -> tuple[Block, SweepWork]:
     """Room for a block, and for a row, of ``n_rows`` rows of a model of this shape."""
     n_outputs, size, n_values = len(layout.outputs), group.bias.shape[1], group.offset.shape[1]
-    n_columns, n_active, rows = group.both_start - group.next_start, n_outputs + layout.n_steps, min(n_rows, ROWS)
-    n_slots = 1 + max(n_outputs, min(rows * n_outputs, SUMS // size))
+    n_columns, n_active, rows = group.both_start - group.next_start, n_outputs + layout.n_steps, min(n_rows, GIBBS_ROWS)
+    n_slots = 1 + max(n_outputs, min(rows * n_outputs, MOST_SUMS // size))
     block = Block(
         np.empty((rows, n_columns), dtype=np.float32),
         np.empty((rows, n_outputs), dtype=np.float64),
@@ -151,9 +151,9 @@ def begin_block(
     n_slots = 0
     for r in range(min(len(states) - first, len(k.low))):
         b, n_open = first + r, 0
-        fill_row(keys[b], w.luck)
+        fill_row(keys[b], w.noise)
         if probs.shape[2] == 2:
-            _draw_bits(probs, b, w.luck, factors)
+            _draw_bits(probs, b, w.noise, factors)
             _bound_bits(probs, b, r, group.group_of, certain, k.low, k.high)
             _likeliest_bits(probs, b, r, group.group_of, factors, k.top)
             _show_bits(probs, b, r, factors, k.low, real_guess, k.guess)
@@ -172,10 +172,10 @@ def begin_block(
 
 
 @vectorised
-def _draw_bits(probs: Floats, b: int, luck: Floats, factors: Ints) -> None:
+def _draw_bits(probs: Floats, b: int, noise: Floats, factors: Ints) -> None:
     """The first guess of row b where all factors are bits; this and the next three are apart so that each is one vector loop."""
-    for i in range(len(luck)):
-        factors[b, i] = int((luck[i] >= probs[b, i, 0]) & (probs[b, i, 1] > 0.0))
+    for i in range(len(noise)):
+        factors[b, i] = int((noise[i] >= probs[b, i, 0]) & (probs[b, i, 1] > 0.0))
 
 
 @vectorised
@@ -222,7 +222,7 @@ def _begin_factor(
 ) -> None:
     """Draws the first guess of factor i, and says when the conditioner is to be asked about it."""
     n, start, top = layout.outputs[i], layout.start[i], largest(probs, b, i, layout.outputs[i])
-    value = draw_at(probs, b, i, n, w.luck[i])
+    value = draw_at(probs, b, i, n, w.noise[i])
     trust = trusted(probs, b, i, layout, group, certain)
     below = 0.0
     for v in range(top):
@@ -373,12 +373,12 @@ def _sweep_row(
     layout, group, k, w = borrowed(layout), borrowed(group), borrowed(block), borrowed(work)
     for sweep in range(sweeps):
         key, anew = derive_one(row_key, np.uint64(sweep)), real_guess and sweep == 0
-        fill_row(key, w.luck)
+        fill_row(key, w.noise)
         n = _choose(b, r, k, w, factors)
         _shuffle(n, derive_one(key, _ORDER), w)
         for step in range(n):
             i = w.order[step]
-            u, value, slot = w.luck[i], k.top[r, i], k.slot[r, i]
+            u, value, slot = w.noise[i], k.top[r, i], k.slot[r, i]
             if u < k.low[r, i] or u >= k.high[r, i]:
                 if slot < 0:
                     slot = len(k.sums) - 1
@@ -395,9 +395,9 @@ def _sweep_row(
 def _choose(b: int, r: int, k: Block, w: SweepWork, factors: Ints) -> int:
     """Writes the factors that this sweep may change to ``w.chosen``; returns how many."""
     n = 0
-    for i in range(len(w.luck)):
+    for i in range(len(w.noise)):
         w.chosen[n] = i
-        n += int((w.luck[i] < k.low[r, i]) | (w.luck[i] >= k.high[r, i]) | (factors[b, i] != k.top[r, i]))
+        n += int((w.noise[i] < k.low[r, i]) | (w.noise[i] >= k.high[r, i]) | (factors[b, i] != k.top[r, i]))
     return n
 
 

@@ -38,7 +38,7 @@ class Influence:
 
 
 @dataclass(frozen=True)
-class Module:
+class VariableGroup:
     """Variables that belong together.
 
     Attributes:
@@ -113,7 +113,7 @@ def _conditioner_sums(conditioner: Conditioner) -> Floats:
     return sums
 
 
-def modules(found: Influence) -> list[Module]:
+def modules(found: Influence) -> list[VariableGroup]:
     """Variables that fall apart: linked where one leads to the other in a step. Largest first; without what hangs on nothing."""
     n = len(found.states)
     links = np.zeros((n, n), dtype=np.bool_)
@@ -121,12 +121,12 @@ def modules(found: Influence) -> list[Module]:
     return _modules(found, links)
 
 
-def dependent_groups(found: Influence) -> list[Module]:
+def dependent_groups(found: Influence) -> list[VariableGroup]:
     """Variables that are drawn together: linked by the conditioner, given state and action. Largest first."""
     return _modules(found, found.others > 0.0)
 
 
-def _modules(found: Influence, links: NDArray[np.bool_]) -> list[Module]:
+def _modules(found: Influence, links: NDArray[np.bool_]) -> list[VariableGroup]:
     """The connected components of more than one variable, or of one that leads to itself."""
     _, label = connected_components(csr_matrix(links.astype(np.int64)), directed=False)
     result = []
@@ -135,5 +135,5 @@ def _modules(found: Influence, links: NDArray[np.bool_]) -> list[Module]:
         if not links[np.ix_(members, members)].any():
             continue
         leads = (found.states[members] > 0.0).any(axis=0) | (found.conditions[members] > 0.0).any(axis=0)
-        result.append(Module(members, np.flatnonzero(leads), bool((found.actions[members] > 0.0).any())))
+        result.append(VariableGroup(members, np.flatnonzero(leads), bool((found.actions[members] > 0.0).any())))
     return sorted(result, key=lambda module: -len(module.outputs))

@@ -24,7 +24,7 @@ ACTIVATION_CODES = {"sigmoid": SIGMOID, "relu": RELU, "silu": SILU, "tanh": TANH
 
 _PER_LN2 = np.float32(1.44269504)
 _LN2_HIGH, _LN2_LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
-_HALF, _ONE, _TWO = np.float32(0.5), np.float32(1.0), np.float32(2.0)
+_HALF, _ONE_32, _TWO_32 = np.float32(0.5), np.float32(1.0), np.float32(2.0)
 _LOWEST, _HIGHEST = np.float32(-87.0), np.float32(88.0)
 _P0, _P1, _P2 = np.float32(1.9875691500e-4), np.float32(1.3981999507e-3), np.float32(8.3334519073e-3)
 _P3, _P4, _P5 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1), np.float32(5.0000001201e-1)
@@ -42,7 +42,7 @@ def exp32(x: np.float32) -> np.float32:
     r = (x - n * _LN2_HIGH) - n * _LN2_LOW
     series = ((((_P0 * r + _P1) * r + _P2) * r + _P3) * r + _P4) * r + _P5
     power = np.int32((np.int32(n) + 127) << 23).view(np.float32)
-    return np.float32(((series * r) * r + r + _ONE) * power)
+    return np.float32(((series * r) * r + r + _ONE_32) * power)
 
 
 _T0, _T1, _T2, _T3, _T4, _T5, _T6 = (1.0 / math.factorial(k) for k in range(7))
@@ -69,13 +69,13 @@ def activate(table: Floats32, row: int, n: int, code: int) -> None:
             table[row, h] = max(table[row, h], np.float32(0.0))
     elif code == SILU:
         for h in range(n):
-            table[row, h] = table[row, h] / (_ONE + exp32(-table[row, h]))
+            table[row, h] = table[row, h] / (_ONE_32 + exp32(-table[row, h]))
     elif code == SIGMOID:
         for h in range(n):
-            table[row, h] = _ONE / (_ONE + exp32(-table[row, h]))
+            table[row, h] = _ONE_32 / (_ONE_32 + exp32(-table[row, h]))
     else:
         for h in range(n):
-            table[row, h] = _ONE - _TWO / (_ONE + exp32(_TWO * table[row, h]))
+            table[row, h] = _ONE_32 - _TWO_32 / (_ONE_32 + exp32(_TWO_32 * table[row, h]))
 
 
 @vectorised
@@ -170,13 +170,13 @@ def product(sums: Floats32, row: int, code: int, table: Floats32, g: int, k: int
             total += max(sums[row, h], np.float32(0.0)) * table[g, k, h]
     elif code == SILU:
         for h in range(table.shape[2]):
-            total += sums[row, h] / (_ONE + exp32(-sums[row, h])) * table[g, k, h]
+            total += sums[row, h] / (_ONE_32 + exp32(-sums[row, h])) * table[g, k, h]
     elif code == SIGMOID:
         for h in range(table.shape[2]):
-            total += table[g, k, h] / (_ONE + exp32(-sums[row, h]))
+            total += table[g, k, h] / (_ONE_32 + exp32(-sums[row, h]))
     elif code == TANH:
         for h in range(table.shape[2]):
-            total += (_ONE - _TWO / (_ONE + exp32(_TWO * sums[row, h]))) * table[g, k, h]
+            total += (_ONE_32 - _TWO_32 / (_ONE_32 + exp32(_TWO_32 * sums[row, h]))) * table[g, k, h]
     else:
         for h in range(table.shape[2]):
             total += sums[row, h] * table[g, k, h]
@@ -251,7 +251,7 @@ def probabilities(logits: Floats32, outputs: Ints) -> Floats:
     return out
 
 
-ROWS = 32
+KERNEL_ROWS = 32
 """Rows of a batch that a predictor's layers are applied to one after another, with the same weights at hand."""
 
 
@@ -460,13 +460,13 @@ def dense_logits(states: Ints, actions: Ints, layout: Layout, dense: DenseWeight
     """A dense predictor's logits, float32 [B, O, K]; values a factor lacks are at -1e9."""
     n_outputs, width = len(layout.outputs), layout.outputs.max()
     logits = np.full((len(states), n_outputs, width), np.float32(-1e9), dtype=np.float32)
-    rows = min(len(states), ROWS)
+    rows = min(len(states), KERNEL_ROWS)
     active = np.empty(states.shape[1] + layout.n_steps, dtype=np.int64)
     now = np.empty((rows, dense.to_columns.shape[1]), dtype=np.float32)
     after = np.empty_like(now)
     columns = np.empty((rows, len(dense.column_bias)), dtype=np.float32)
-    for first in range(0, len(states), ROWS):
-        n_rows = min(ROWS, len(states) - first)
+    for first in range(0, len(states), KERNEL_ROWS):
+        n_rows = min(KERNEL_ROWS, len(states) - first)
         _dense_block(first, n_rows, states, actions, layout, dense, active, now, after, columns)
         for r in range(n_rows):
             if width == 2:

@@ -15,7 +15,7 @@ from mbagent.models.neural.bit_kernels import CausalBits, pack_bits
 from mbagent.models.neural.connections import PruningConfig, check_fraction
 from mbagent.models.neural.export import CompiledBody, as_rows, compiled_body, pack_dense, pack_groups
 from mbagent.models.neural.gibbs import sample_sweeps
-from mbagent.models.neural.influence import Module, dependent_groups, influence, modules
+from mbagent.models.neural.influence import VariableGroup, dependent_groups, influence, modules
 from mbagent.models.neural.kernels import Floats32, GroupWeights, probabilities
 from mbagent.models.neural.network_pair import NO_MARKS, NetworkPair
 from mbagent.models.neural.networks import DensePredictor
@@ -293,7 +293,7 @@ class NeuralTransitionModel(NetworkPair):
                 self._rules[key] = (compile_rules(*left), compile_rules(*left, settled=True))
         return self._rules[key][settled]
 
-    def modules(self) -> list[Module]:
+    def modules(self) -> list[VariableGroup]:
         """The sets of variables that fall apart into models of their own (paper section 5), largest first; see ``modules``.
 
         Raises:
@@ -301,7 +301,7 @@ class NeuralTransitionModel(NetworkPair):
         """
         return modules(influence(self, effective=True))
 
-    def dependent_groups(self) -> list[Module]:
+    def dependent_groups(self) -> list[VariableGroup]:
         """The sets of variables that are drawn together, given state and action; as ``modules``."""
         return dependent_groups(influence(self, effective=True))
 

@@ -32,7 +32,7 @@ ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "tanh": torch.tanh,
 }
 
-IMPOSSIBLE = -1e9
+MASKED_LOGIT = -1e9
 """The logit of a value that a factor does not have."""
 
 RESIDUAL_START = 2.0
@@ -83,7 +83,7 @@ class FactorCodec(nn.Module):
         self._constant("single_actions", torch.eye(self.n_actions))
         self._constant("slots", torch.from_numpy(factor * self.width + value))
         possible = np.arange(self.width) < np.asarray(self.outputs)[:, None]
-        self._constant("floor", torch.from_numpy(np.where(possible, 0.0, IMPOSSIBLE).astype(np.float32)))
+        self._constant("floor", torch.from_numpy(np.where(possible, 0.0, MASKED_LOGIT).astype(np.float32)))
 
     def _constant(self, name: str, value: Tensor) -> None:
         self.register_buffer(name, value, persistent=False)
@@ -126,7 +126,7 @@ class Predictor(Protocol):
     """What every predictor body is: an ``nn.Module`` that gives each output factor's logits from a state and an action."""
 
     def __call__(self, states: Tensor, actions: Tensor) -> Tensor:
-        """Logits [B, O, K] from states int64 [B, F] and actions int64 [B]; values a factor lacks are at ``IMPOSSIBLE``."""
+        """Logits [B, O, K] from states int64 [B, F] and actions int64 [B]; values a factor lacks are at ``MASKED_LOGIT``."""
         ...
 
 

@@ -23,7 +23,7 @@ from mbagent.models.neural.networks import ACTIVATIONS, Affine, Conditioner, Den
 from mbagent.models.neural.training import Examples, Trainer
 from mbagent.types import Progress
 
-ROWS = 20_000
+PRUNING_ROWS = 20_000
 """Transitions that are looked at, at most; what they cost is scaled up to all of them."""
 
 
@@ -184,7 +184,7 @@ def trim_predictor(predictor: DensePredictor, rows: Examples, n_transitions: int
         rows: distinct transitions.
         n_transitions: that they stand for.
     """
-    rows, codec, out = rows.spread(ROWS), predictor.codec, predictor.out
+    rows, codec, out = rows.spread(PRUNING_ROWS), predictor.codec, predictor.out
     inputs = values = codec.inputs(rows.states, rows.actions)
     layers = [layer for layer in predictor.layers if isinstance(layer, Affine)]
     activation = ACTIVATIONS[predictor.activation]
@@ -214,7 +214,7 @@ def trim_predictor(predictor: DensePredictor, rows: Examples, n_transitions: int
 @torch.no_grad()
 def trim_conditioner(conditioner: Conditioner, predictor: nn.Module, rows: Examples, n_transitions: int) -> None:
     """The same for each of a conditioner's groups, given what the predictor says. Arguments as above."""
-    rows, codec, size = rows.spread(ROWS), conditioner.codec, conditioner.group_size
+    rows, codec, size = rows.spread(PRUNING_ROWS), conditioner.codec, conditioner.group_size
     columns = torch.cat((codec.inputs(rows.states, rows.actions), codec.targets(rows.outcomes)), dim=1)
     logits = conditioner(rows.states, rows.actions, rows.outcomes)
     if conditioner.correction:
@@ -241,7 +241,7 @@ def _columns(codec: FactorCodec, logits: Tensor) -> Tensor:
 BATCHES = 0x9F
 """Added to the seed of the batches: they are not those of the fit before."""
 
-ROUNDS = 3
+PRUNING_ROUNDS = 3
 """How often what the data do not call for goes; what is left says it more clearly each time that it is trained again."""
 
 SETTLE, RATE = 600, 0.25
@@ -278,7 +278,7 @@ def prune_networks(
     half = progress if progress is None or trainer.conditioner is None else lambda share: progress(0.5 * share)
     epochs = trainer.fit(train, held_out, generator, half, Shrinking(connections["predictor"], fraction, config))
     if isinstance(predictor, DensePredictor):
-        for _ in range(ROUNDS * config.evidence):
+        for _ in range(PRUNING_ROUNDS * config.evidence):
             trim_predictor(predictor, train, n_transitions)
             epochs += _settle(trainer).fit(train, held_out, generator, None, _as_left(predictor))
     if not both or conditioner is None:
@@ -286,7 +286,7 @@ def prune_networks(
     half = None if progress is None else lambda share: progress(0.5 + 0.5 * share)
     shrinking = Shrinking(connections["conditioner"], fraction, config)
     epochs += trainer.fit_conditioner(train, held_out, generator, half, shrinking)
-    for _ in range(ROUNDS * config.evidence):
+    for _ in range(PRUNING_ROUNDS * config.evidence):
         trim_conditioner(conditioner, predictor, train, n_transitions)
         epochs += _settle(trainer).fit_conditioner(train, held_out, generator, None, _as_left(conditioner))
     return epochs

@@ -62,14 +62,14 @@ class Work(NamedTuple):
 
     Attributes:
         columns: those that are on, int64 [2 * O + n_steps].
-        luck: a number for each factor, [O].
+        noise: a number for each factor, [O].
         sums: input of one group, [1, G].
         row_logits: of one factor, [K].
         given: its distribution, [K].
     """
 
     columns: Ints
-    luck: Floats
+    noise: Floats
     sums: Floats32
     row_logits: Floats32
     given: Floats
@@ -180,10 +180,10 @@ def _causal_row(
     # The caller keeps all of this alive: no references need be counted for every factor.
     states, logits, probs, factors = borrowed(states), borrowed(logits), borrowed(probs), borrowed(factors)
     layout, group, w = borrowed(layout), borrowed(group), borrowed(work)
-    fill_row(key, w.luck)
+    fill_row(key, w.noise)
     n_columns, place = active_columns(states, b, action, layout, w.columns), 0
     for i in range(len(layout.outputs)):
-        n, u = layout.outputs[i], w.luck[i]
+        n, u = layout.outputs[i], w.noise[i]
         if trusted(probs, b, i, layout, group, certain):
             if n == 2:  # written out, as in sample_independent
                 value = int((0.5 if greedy else u) >= probs[b, i, 0] and probs[b, i, 1] > 0.0)

@@ -36,7 +36,7 @@ CONSTANT_TOLERANCE = 0.002
 PARENT = 2
 """Marks a bit that matters; 0 and 1 are values that a bit is taken for."""
 
-ROWS = 8192
+TABLE_ROWS = 8192
 """Transitions that differences are measured on, at most."""
 
 Marks = NDArray[np.int8]
@@ -112,7 +112,7 @@ def paths(pair: Pair) -> NDArray[np.bool_]:
 @torch.no_grad()
 def find_parents(pair: Pair, rows: Examples) -> Marks:
     """What each outcome bit hangs on: int8 [O, F + O], PARENT or the value that a bit is taken for; of state and outcome."""
-    codec, rows = pair.predictor.codec, rows.spread(ROWS)
+    codec, rows = pair.predictor.codec, rows.spread(TABLE_ROWS)
     columns = torch.cat((codec.inputs(rows.states, rows.actions), codec.targets(rows.outcomes)), dim=1)
     usual, reach, n_bits = (columns.mean(dim=0) > 0.5).float(), paths(pair), codec.n_state_columns
     bits = np.concatenate([np.arange(n_bits), np.arange(codec.n_inputs, columns.shape[1])])

@@ -57,8 +57,8 @@ def test_worlds_too_large_to_list_are_not_listed() -> None:
 @pytest.fixture
 def quick_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     training = TrainingConfig(min_steps=20, max_steps=20)
-    monkeypatch.setattr("mbagent.models.factory.TrainingConfig", lambda: training)
-    monkeypatch.setattr("mbagent.models.factory.PLANE_TRAINING", training)
+    monkeypatch.setattr("mbagent.models.registry.TrainingConfig", lambda: training)
+    monkeypatch.setattr("mbagent.models.registry.PLANE_TRAINING", training)
 
 
 @pytest.mark.usefixtures("quick_fits")

@@ -79,9 +79,9 @@ def test_every_decision_pays_for_what_it_imagines() -> None:
     task = untrained_task()
     planner = planner_for(task, task.goals[0], Effort(8, 2, 16), seed=0)
     planner.plan(task.starts[:1])
-    once = planner.imagined
+    once = planner.expanded
     planner.plan(task.starts[:1])
-    assert planner.imagined == 2 * once > 0
+    assert planner.expanded == 2 * once > 0
 
 
 def test_the_cheapest_effort_that_loses_no_more_is_taken() -> None:

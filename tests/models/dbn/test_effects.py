@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from mbagent.models.dbn import DecisionGraphModel
-from mbagent.models.dbn.effects import SUMS, Effect, questions_for_effect
+from mbagent.models.dbn.effects import SUM_EFFECTS, Effect, questions_for_effect
 from mbagent.models.dbn.features import Observed
 from mbagent.types import Ints
 from tests.models.helpers import dataset
@@ -41,7 +41,7 @@ def truth(effect: Effect) -> NDArray[np.float64]:
     return probs
 
 
-@pytest.mark.parametrize("manner", SUMS)
+@pytest.mark.parametrize("manner", SUM_EFFECTS)
 @pytest.mark.parametrize(("n", "mean", "most"), [(500, 0.1, 0.5), (1500, 0.06, 0.15)])
 def test_stocks_and_queues_are_known_from_few_transitions(effect: Effect, n: int, mean: float, most: float) -> None:
     model = DecisionGraphModel((LAST + 1,), ORDERS)

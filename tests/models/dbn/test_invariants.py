@@ -57,7 +57,7 @@ def test_counts_and_combinations_are_found() -> None:
     rows = dataset(SPACE.cardinalities, 2, before, actions, after, ends).rows()
     invariants = find_invariants(rows, SPACE.planes, (KINDS, COLOURS))
     assert {(int(c), int(v)) for c, v in invariants.counts} == {(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 3)}
-    assert set(np.flatnonzero(invariants.met)) == {0, 1 + KINDS, 2 + 3 * KINDS}
+    assert set(np.flatnonzero(invariants.observed)) == {0, 1 + KINDS, 2 + 3 * KINDS}
     few = find_invariants(rows.select(slice(50)), SPACE.planes, (KINDS, COLOURS))
     assert len(few.counts) == 0
 
@@ -82,7 +82,7 @@ def test_what_breaks_a_law_is_left_out_and_the_others_share_its_probability() ->
     np.testing.assert_array_equal(kept.offsets, [0, 3, 4])
     np.testing.assert_array_equal(kept.states, [[1, 0], [0, 1], [0, 0], [0, 0]])
     np.testing.assert_allclose(kept.probabilities, [0.2, 0.6, 0.2, 1.0])
-    impossible = invariants._replace(met=np.array([False, False, True]))
+    impossible = invariants._replace(observed=np.array([False, False, True]))
     assert len(enforced(impossible, weights, cells, states, found).states) == 6  # no outcome keeps it: all stay
 
 
@@ -92,10 +92,10 @@ def test_draws_keep_the_laws_and_are_told_their_probability() -> None:
     assert len(layout.counts) > 0
     some, actions = states[:400], rng.integers(2, size=400)
     drawn, over = model.sample(some, actions, rng)
-    assert all_kept(layout.counts, layout.met, layout.weights, layout.cells, some, drawn)[~over].all()
+    assert all_kept(layout.counts, layout.observed, layout.weights, layout.cells, some, drawn)[~over].all()
     found = model.successors(some[:50], actions[:50], 256, 0)
     rows, on = found.rows, ~found.terminated
-    assert all_kept(layout.counts, layout.met, layout.weights, layout.cells, some[rows], found.states)[on].all()
+    assert all_kept(layout.counts, layout.observed, layout.weights, layout.cells, some[rows], found.states)[on].all()
     np.testing.assert_allclose(np.bincount(rows, weights=found.probabilities), 1.0)
     determined = np.exp(model.log_prob(some[rows], actions[rows], found.states, found.terminated))
     totals = np.bincount(rows, weights=determined)
@@ -138,4 +138,4 @@ def test_laws_are_saved_and_damaged_ones_refused() -> None:
 
 def test_no_laws_cost_nothing() -> None:
     assert NO_INVARIANTS.none
-    assert not Invariants(np.array([[0, 1]]), NO_INVARIANTS.met).none
+    assert not Invariants(np.array([[0, 1]]), NO_INVARIANTS.observed).none

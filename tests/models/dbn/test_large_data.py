@@ -31,10 +31,9 @@ def test_columns_of_some_cells_are_those_of_all() -> None:
 
 @pytest.fixture
 def little_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("MOST_CELLS", "QUICK_CELLS"):
+    for name in ("MOST_TABLE_ENTRIES", "QUICK_CELLS"):
         monkeypatch.setattr(large_data, name, 60_000)
-    for module in (large_data, large_data):
-        monkeypatch.setattr(module, "CHUNK", 100_000)
+    monkeypatch.setattr(large_data, "ENTRIES_PER_CHUNK", 100_000)
 
 
 def likeliest(data: TransitionDataset, tests: TransitionBatch) -> tuple[LocalGraphModel, Any]:
@@ -119,7 +118,7 @@ def test_rows_in_files_teach_the_same(flat: bool, tmp_path: Path, monkeypatch: p
 
 def test_what_was_left_out_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(graph_model, "MOST_VALUES", 27 * 200)
-    monkeypatch.setattr(large_data, "MOST_COUNTED", 27 * 150)
+    monkeypatch.setattr(large_data, "MOST_CELLS_COUNTED", 27 * 150)
     space, data = FactoredSpace(Maneuverer(size=3).observation_space), played(Maneuverer(size=3), 400, 20)
     report = DecisionGraphModel(space.cardinalities, 4).fit(data, seed=0)
     assert report.log["left out"] == 200

@@ -5,7 +5,7 @@ import pytest
 from scipy import special
 
 from mbagent.models.dbn.mutex import find_cliques, find_groups
-from mbagent.models.dbn.score import ALL, SINGLE, Target, best_split, count, evidence, evidence_tables, feature_blocks
+from mbagent.models.dbn.score import BY_ALL, BY_CONTEXT, Target, best_split, count, evidence, evidence_tables, feature_blocks
 from mbagent.models.dbn.split_search import find_splits
 from mbagent.models.dbn.splits import Search
 
@@ -51,9 +51,9 @@ def test_the_best_split_has_the_evidence_that_counting_by_hand_gives() -> None:
     for b in range(6):
         sides = [[total((context == c) & (table[:, b] == side)) for c in range(3)] for side in (False, True)]
         pooled = [max(sum(side), total(table[:, b] == on)) for on, side in zip((False, True), sides, strict=True)]
-        gains[ALL, 0, b] = sum(pooled) - sum(before) - 2.0
+        gains[BY_ALL, 0, b] = sum(pooled) - sum(before) - 2.0
         for c in range(3):
-            gains[SINGLE, c, b] = sides[0][c] + sides[1][c] - before[c] - 5.0
+            gains[BY_CONTEXT, c, b] = sides[0][c] + sides[1][c] - before[c] - 5.0
     best = max(gains, key=lambda key: gains[key])
     assert chosen.gain == pytest.approx(gains[best])
     assert (chosen.kind, chosen.which, chosen.feature) == best

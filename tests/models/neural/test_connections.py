@@ -122,7 +122,7 @@ def test_what_many_connections_are_left_of_goes_by_whole_matrices() -> None:
     model._marks[:] = PARENT
     model.load_state_dict(model.state_dict())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mbagent.models.tabulate.MOST_PARENTS", 1)
+        patch.setattr("mbagent.models.neural.truth_tables.MOST_PARENTS", 1)
         assert model.rules() is None
         model.pruned_as = "connections"
         assert model.rules() is not None

@@ -44,8 +44,8 @@ def mixed_world(n: int, seed: int = 0) -> tuple[TransitionDataset, Callable[[Int
         return np.stack([third % 2, third, np.full(3, state[0]), (state[3] + third) % 4, third == 2], axis=1)
 
     states, actions = random_rows(MIXED, 2, n, seed)
-    luck = np.random.default_rng(seed + 1).integers(3, size=n)
-    following = np.stack([possible(s, a)[u] for s, a, u in zip(states, actions, luck, strict=True)])
+    noise = np.random.default_rng(seed + 1).integers(3, size=n)
+    following = np.stack([possible(s, a)[u] for s, a, u in zip(states, actions, noise, strict=True)])
     return dataset(MIXED, 2, states, actions, following[:, :-1], following[:, -1] == 1), possible
 
 

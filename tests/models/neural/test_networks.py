@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from mbagent.models import Conditioner, DensePredictor, FactorCodec
-from mbagent.models.neural.networks import IMPOSSIBLE, Dropout, Mask
+from mbagent.models.neural.networks import MASKED_LOGIT, Dropout, Mask
 from tests.models.helpers import MIXED, random_rows
 
 CARDINALITIES = [(2, 2, 2), MIXED, (5,), (1, 2, 3)]
@@ -28,7 +28,7 @@ def test_columns_and_logits_tell_values_apart(cardinalities: tuple[int, ...]) ->
     logits = codec.logits(20.0 * columns - 10.0)
     assert torch.equal(logits.argmax(dim=2), following)
     impossible = np.arange(codec.width) >= np.asarray(codec.outputs)[:, None]
-    assert (logits[:, torch.from_numpy(impossible)] == IMPOSSIBLE).all()
+    assert (logits[:, torch.from_numpy(impossible)] == MASKED_LOGIT).all()
 
 
 @pytest.mark.parametrize("mask", ["causal", "others"])
@@ -121,5 +121,5 @@ def test_large_groups_computed_one_after_another_are_the_same(
     conditioner = Conditioner(codec, "others", 5, correction=False, generator=generator())
     given = rows(codec)
     together = conditioner(*given)
-    monkeypatch.setattr("mbagent.models.networks.LARGE_GROUP", 1)
+    monkeypatch.setattr("mbagent.models.neural.networks.LARGE_GROUP", 1)
     torch.testing.assert_close(conditioner(*given), together)

@@ -32,7 +32,7 @@ def pruned(learned: NeuralTransitionModel) -> Iterator[NeuralTransitionModel]:
 
 def few_tables(model: NeuralTransitionModel, monkeypatch: pytest.MonkeyPatch) -> BitRules:
     """As if most bits had too many parents left."""
-    monkeypatch.setattr("mbagent.models.tabulate.MOST_PARENTS", int(np.median((model._marks == PARENT).sum(axis=1))))
+    monkeypatch.setattr("mbagent.models.neural.truth_tables.MOST_PARENTS", int(np.median((model._marks == PARENT).sum(axis=1))))
     model.load_state_dict(model.state_dict())
     model.pruned_as = "tables"
     rules = model.rules()
