@@ -24,8 +24,8 @@ class Graphs(NamedTuple):
 
     Attributes:
         changing: units that have graphs, int64.
-        pairs: where each variable's pairs (action class, value) begin, int64 [U + 1]; pair ``action_class * cardinality + value``, with the
-            action's way, see ``encoding.ActionEncoding``.
+        pairs: where each variable's pairs (action class, value) begin, int64 [U + 1]; the number of a pair within a variable is
+            ``action_class * cardinality + value``, see ``features.ActionEncoding``.
         entries: where the entries of each pair begin, int64 [pairs + 1].
         values: the value that an entry is about, int64 [E].
         nodes: its first node, int64 [E].

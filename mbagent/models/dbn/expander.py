@@ -373,7 +373,7 @@ def _fill(
 def _mutex_distribution(
     mutex: int, first: int, touched: Ints, variables: Ints, exactly: bool, rates: Floats, mutex_members: Ints, out: Floats
 ) -> int:
-    """Lists a mutex group's affected variables from ``mutex_members[first]`` on, with probabilities; returns the only possible one, or -1.
+    """Lists a mutex group's affected variables from ``mutex_members[first]`` on; returns the only possible one, or -1.
 
     As ``mutexes.mutex_distribution``; the last chance is that of none.
     """

@@ -152,7 +152,7 @@ class PlaneTable:
         return Observed(self.pattern, self.actions, now, then).select(self.cells_since(channel))
 
     def determined_by(self, channel: int) -> Ints | None:
-        """Features that alone determine a channel, see ``plane_features.determined_by``; None if none do, or it rarely changed."""
+        """Features that alone determine a channel (``plane_features.determined_by``); None if none do or it rarely changed."""
         before, after = (planes[:, channel] for planes in self.every)
         if (before != after).sum() < FEWEST_CHANGES:
             return None
