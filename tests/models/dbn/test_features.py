@@ -80,5 +80,5 @@ def test_planes_learn_parts_too_and_weights_come_back() -> None:
 
 
 def test_parts_must_make_the_actions() -> None:
-    with pytest.raises(ValueError, match="are 256, not 255"):
+    with pytest.raises(ValueError, match="make 256 actions, not 255"):
         DecisionGraphModel((2,), 255, parts=SWITCHES)

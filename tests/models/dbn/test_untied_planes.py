@@ -45,7 +45,7 @@ def test_cells_are_learned_for_themselves_where_rules_hang_on_the_place() -> Non
     other.load_state_dict(model.state_dict())
     again = other.log_prob(rows.states, rows.actions, rows.next_states, rows.terminated)
     np.testing.assert_array_equal(again, model.log_prob(rows.states, rows.actions, rows.next_states, rows.terminated))
-    with pytest.raises(ValueError, match="hangs on the place"):
+    with pytest.raises(ValueError, match="depend on the position"):
         other.for_space(spaces.MultiBinary((11, 11)))
 
 
