@@ -140,7 +140,7 @@ SELDOM = 1e-9
 
 
 class Effect(Enum):
-    """What a factor's targets are: the next value, its change, or its deviation from a sum or difference with an operand.
+    """Targets of a factor: the next value, its change, or its deviation from a sum or difference with an operand.
 
     Clipped sums and differences are limited to the factor's bounds before the random deviation is added; others are not.
     """

@@ -283,7 +283,7 @@ class _Table:
         changing = (self.rows.before[observed] != self.rows.after[observed]).any(axis=0)
         return feature_kinds(self.layout, self.rows.before[observed], changing)
 
-    def build(self, asked: Sequence[Question], found: Sequence[Search], observed: Ints, still: float) -> Graphs:
+    def build(self, questions: Sequence[Question], found: Sequence[Search], observed: Ints, still: float) -> Graphs:
         """The graphs; smoothing is estimated from the observed rows."""
         smoothings, n_action_classes = [], self.layout.encoding.n_action_classes
         for variable, cardinality in enumerate(self.layout.outputs):
@@ -295,7 +295,7 @@ class _Table:
                 effect, int(cardinality), n_action_classes if operand is None else operand.cardinality, some
             )
             smoothings.append(smoothing if operand is None else for_all_actions(smoothing, operand.cardinality, n_action_classes))
-        return build(self.layout, asked, found, smoothings, still)
+        return build(self.layout, questions, found, smoothings, still)
 
 
 def no_synchronic(graphs: Graphs) -> Graphs:
@@ -330,17 +330,17 @@ def fit_graphs(
     table, usual = _Table(layout, rows, resets, effects, since), np.flatnonzero(~resets)
     last = len(layout.outputs) - 1
     rows_of = {variable: np.arange(len(rows)) if variable == last else usual for variable in range(last + 1)}
-    graphs, asked, found = _graphs(table, rows_of, usual, True, in_pairs)
+    graphs, questions, found = _graphs(table, rows_of, usual, True, in_pairs)
     layout = _with_mutexes(layout, graphs, rows)
     synchronic = no_synchronic(graphs)
     if jointly:
-        synchronic, more_asked, more_found = _synchronic_graphs(table, layout, graphs, usual, in_pairs)
-        asked, found = [*asked, *more_asked], [*found, *more_found]
+        synchronic, more_questions, more_found = _synchronic_graphs(table, layout, graphs, usual, in_pairs)
+        questions, found = [*questions, *more_questions], [*found, *more_found]
     reset = graphs
     if resets.any():
         rare = np.flatnonzero(resets)
         reset, _, _ = _graphs(table, dict.fromkeys(range(last), rare), rare, False, in_pairs)
-    return Fitted(layout, graphs, synchronic, reset, bool(resets.any()), asked, found)
+    return Fitted(layout, graphs, synchronic, reset, bool(resets.any()), questions, found)
 
 
 def _synchronic_graphs(

@@ -250,9 +250,9 @@ class LocalGraphModel(DecisionGraphModel):
         self.local = LocalGraphs(graphs, no_synchronic(graphs), features, cards, self.encoding, ())
         self._instantiate((), ())
 
-    def _instantiate(self, asked: tuple[Question, ...], found: tuple[Search, ...]) -> None:
+    def _instantiate(self, questions: tuple[Question, ...], found: tuple[Search, ...]) -> None:
         layout, graphs, synchronic = instantiate(self.local, self.board)
-        self.fitted = Fitted(layout, graphs, synchronic, graphs, False, asked, found)
+        self.fitted = Fitted(layout, graphs, synchronic, graphs, False, questions, found)
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel."""
@@ -344,20 +344,20 @@ class LocalGraphModel(DecisionGraphModel):
         local = self.local
         planes = PlaneTable(rows, self.board, local.cardinalities, local.features, self.encoding, since, in_pairs)
         self.searched, self.counted = len(planes.rows), len(planes.every_action)
-        graphs, asked, found = fit_channels(planes)
+        graphs, questions, found = fit_channels(planes)
         self.local = replace(local, graphs=graphs, synchronic=no_synchronic(graphs), mutexes=(), invariants=NO_INVARIANTS)
         self._instantiate((), ())
         some = thinned(rows, SOME_ROWS)
         mutexes = find_mutexes(rows, self.board, local.cardinalities, some, self._ones(some))
         self.local = replace(self.local, mutexes=mutexes)
         layout = with_mutexes(self.fitted.layout, mutexes)
-        self.fitted = replace(self.fitted, layout=layout, asked=tuple(asked), found=tuple(found))
+        self.fitted = replace(self.fitted, layout=layout, asked=tuple(questions), found=tuple(found))
         if not jointly:
             return
-        synchronic, more_asked, more_found = fit_synchronic(planes, layout, self.fitted.usual)
+        synchronic, more_questions, more_found = fit_synchronic(planes, layout, self.fitted.usual)
         if len(synchronic.changing):
             self.local = replace(self.local, synchronic=synchronic)
-            self._instantiate((*asked, *more_asked), (*found, *more_found))
+            self._instantiate((*questions, *more_questions), (*found, *more_found))
 
     def _enforce_invariants(self, rows: TransitionBatch) -> None:
         """Enforces the invariants of the transitions that the model's own samples would violate."""

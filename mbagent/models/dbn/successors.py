@@ -203,7 +203,7 @@ def _put(state: Ints, number: int, value: int, layout: Layout, ended: bool) -> b
 
 @compiled
 def reset_draws(rate: float, n_grid: int) -> int:
-    """Number of ``n_grid`` draws for resets: their share, at least a quarter, but at least one each for resets and usual steps."""
+    """Number of ``n_grid`` draws for resets: their share or a quarter, but at least one each for resets and usual steps."""
     if rate <= 0.0 or rate >= 1.0:
         return 0 if rate <= 0.0 else n_grid
     return max(1, min(n_grid - 1, max(n_grid // 4, math.ceil(rate * n_grid))))
