@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from mbagent.types import Floats
 from mbagent_envs import FlierCatcher, GeyserRunner, Maneuverer
-from mbagent_envs.game import Bits, Game, Scene
-from mbagent_envs.random_keys import KeyArray
+from mbagent_envs.game import Game, Scene
+from mbagent_envs.types import Bits, Keys
 
 
 class Relabelled(Game):
@@ -36,11 +36,11 @@ class Relabelled(Game):
     def _renamed(self, obs: Bits, order: npt.NDArray[np.int64]) -> Bits:
         return np.ascontiguousarray(obs.reshape(len(obs), -1)[:, order].reshape(obs.shape))
 
-    def initial(self, keys: KeyArray) -> Bits:
+    def initial(self, keys: Keys) -> Bits:
         """See Game."""
         return self._renamed(self._game.initial(keys), self._bits)
 
-    def transition(self, obs: Bits, actions: npt.NDArray[Any], keys: KeyArray) -> Bits:
+    def transition(self, obs: Bits, actions: npt.NDArray[Any], keys: Keys) -> Bits:
         """See Game."""
         following = self._game.transition(self._renamed(obs, self._back), self._actions[actions.astype(np.int64)], keys)
         return self._renamed(following, self._bits)

@@ -12,8 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from mbagent.types import Bools, Floats, Ints
-from mbagent_envs.game import Bits, Game, Scene
-from mbagent_envs.random_keys import KeyArray, derive, uniforms
+from mbagent_envs.game import Game, Scene
+from mbagent_envs.random_keys import derive, uniforms
+from mbagent_envs.types import Bits, Keys
 
 ROWS, COLUMNS = np.array([-1, 0, 1, 0]), np.array([0, 1, 0, -1])
 """Moves up, right, down, left."""
@@ -41,10 +42,10 @@ class BoardWorld(Game):
         return np.asarray((planes[:, 0] & planes[:, 2]).any(axis=1))
 
     @abstractmethod
-    def move(self, obs: Bits, actions: Ints, keys: KeyArray) -> Bits:
+    def move(self, obs: Bits, actions: Ints, keys: Keys) -> Bits:
         """Next observations [B, n] of states that are not over."""
 
-    def transition(self, obs: Bits, actions: npt.NDArray[Any], keys: KeyArray) -> Bits:
+    def transition(self, obs: Bits, actions: npt.NDArray[Any], keys: Keys) -> Bits:
         """See Game."""
         following = self.move(obs, actions.astype(np.int64), keys)
         ends = np.flatnonzero(self.over(obs))
@@ -95,12 +96,12 @@ class BoardWorld(Game):
 class TwoPlayers(BoardWorld):
     """Two players in one plane, who both move with the action; a new layout where one of them was on the target."""
 
-    def initial(self, keys: KeyArray) -> Bits:
+    def initial(self, keys: Keys) -> Bits:
         """See Game."""
         luck = uniforms(keys, 3 + self.size**2)
         return self.scatter(luck[:, 3:], tuple(self.cells_of(luck[:, i]) for i in range(3)))
 
-    def move(self, obs: Bits, actions: Ints, keys: KeyArray) -> Bits:
+    def move(self, obs: Bits, actions: Ints, keys: Keys) -> Bits:
         """See BoardWorld."""
         following = obs.copy()
         before, after = self.planes(obs), self.planes(following)
@@ -117,7 +118,7 @@ class PushedBox(BoardWorld):
 
     wall_density: ClassVar[float] = 0.15
 
-    def initial(self, keys: KeyArray) -> Bits:
+    def initial(self, keys: Keys) -> Bits:
         """See Game."""
         luck, inner = uniforms(keys, 3 + self.size**2), self.size - 2
         row, column = 1 + (luck[:, 1] * inner).astype(np.int64), 1 + (luck[:, 2] * inner).astype(np.int64)
@@ -129,7 +130,7 @@ class PushedBox(BoardWorld):
         n = self.size
         return np.asarray(self.planes(obs)[:, 2][:, [0, n - 1, n * n - n, n * n - 1]].any(axis=1))
 
-    def move(self, obs: Bits, actions: Ints, keys: KeyArray) -> Bits:
+    def move(self, obs: Bits, actions: Ints, keys: Keys) -> Bits:
         """See BoardWorld."""
         following = obs.copy()
         before, after = self.planes(obs), self.planes(following)
@@ -151,14 +152,14 @@ class Switch(BoardWorld):
 
     n_switches: ClassVar[int] = 1
 
-    def initial(self, keys: KeyArray) -> Bits:
+    def initial(self, keys: Keys) -> Bits:
         """See Game."""
         luck = uniforms(keys, 3 + self.size**2)
         obs = self.scatter(luck[:, 3:], (self.cells_of(luck[:, 0]), self.cells_of(luck[:, 1])))
         obs[:, -1] = luck[:, 2] < 0.5
         return obs
 
-    def move(self, obs: Bits, actions: Ints, keys: KeyArray) -> Bits:
+    def move(self, obs: Bits, actions: Ints, keys: Keys) -> Bits:
         """See BoardWorld."""
         following = obs.copy()
         before, after = self.planes(obs), self.planes(following)
