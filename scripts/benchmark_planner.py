@@ -25,20 +25,20 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from harness import check_run, open_folder, write_csv
 from mbagent import files
-from mbagent.analysis.folders import check_run, open_folder, write_csv
-from mbagent.analysis.planning_benchmark.crowds import WORLDS, compare_values
-from mbagent.analysis.planning_benchmark.latency import SETTINGS, steady
-from mbagent.analysis.planning_benchmark.latency import measure as measure_latency
-from mbagent.analysis.planning_benchmark.network_search import EFFORTS, measure_own, ratios, rows_of_mctx
-from mbagent.analysis.planning_benchmark.networks import build_task, pruned, run_networks_in_mctx
-from mbagent.analysis.planning_benchmark.noise import Sampler, trained
-from mbagent.analysis.planning_benchmark.page import TITLES, shown, write_page
-from mbagent.analysis.planning_benchmark.peers import PeerError
-from mbagent.analysis.planning_benchmark.quality import TOY_TEXT, play_game, play_table, scales, summary
-from mbagent.analysis.planning_benchmark.regret import Settings, compare
-from mbagent.analysis.planning_benchmark.sampling import compare_short_cut, compare_with_naive
-from mbagent.analysis.planning_benchmark.start import GAMES, first_decisions
+from studies.planning.latency import SETTINGS, steady
+from studies.planning.latency import measure as measure_latency
+from studies.planning.network_search import EFFORTS, measure_own, ratios, rows_of_mctx
+from studies.planning.networks import build_task, pruned, run_networks_in_mctx
+from studies.planning.page import TITLES, shown, write_page
+from studies.planning.peers import PeerError
+from studies.planning.quality import TOY_TEXT, play_game, play_table, scales, summary
+from studies.planning.regret import Settings, compare
+from studies.planning.sampling import compare_short_cut, compare_with_naive
+from studies.planning.start import GAMES, first_decisions
+from worlds.coupled import WORLDS, compare_values
+from worlds.synthetic_dbn import Sampler, trained
 
 Rows = list[dict[str, Any]]
 Say = Callable[[str], None]

@@ -24,11 +24,11 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from mbagent.analysis.cases import CASES, find_case
-from mbagent.analysis.comparison import BASELINES, FULL, QUICK, Settings, load, run
-from mbagent.analysis.report import write_report
-from mbagent.analysis.runner import JobsFailedError
-from mbagent.analysis.summary import save_csv, summarise
+from studies.comparison.page import write_report
+from studies.comparison.plan import BASELINES, FULL, QUICK, Settings, load, run
+from studies.comparison.runner import JobsFailedError
+from studies.comparison.summary import save_csv, summarise
+from worlds.games import CASES, find_case
 
 
 @dataclass(frozen=True)

@@ -22,13 +22,12 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from harness import check_run, open_folder, run_all, write_csv
 from mbagent import files
-from mbagent.analysis.external.besides import BESIDES, BesideWorld
-from mbagent.analysis.external.coverage import Row, Study, draw_coverage, run_study
-from mbagent.analysis.external.worlds import exact_world, find_world
-from mbagent.analysis.folders import check_run, open_folder, write_csv
-from mbagent.analysis.parallel import run_all
 from mbagent.exploration import EXPLORATIONS
+from studies.learning.coverage import Row, Study, draw_coverage, run_study
+from worlds.distractors import BESIDES, BesideWorld
+from worlds.environments import exact_world, find_world
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class Args:
     """Compare explorations."""
 
     worlds: tuple[str, ...] = ("FrozenLake 8x8", "CliffWalking", "Taxi")
-    """Which environments: those of the benchmark whose rules are known, or made-up ones (analysis.external.besides)."""
+    """Which environments: those of the benchmark whose rules are known, or made-up ones (worlds.distractors)."""
     explorations: tuple[str, ...] = ("random", "auto")
     """Which explorations."""
     marks: tuple[int, ...] = (500, 1000, 2000, 5000, 10_000, 20_000)

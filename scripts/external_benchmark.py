@@ -26,11 +26,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from mbagent.analysis.external.experiment import AGENTS, TRUE, Row, Task, run_task
-from mbagent.analysis.external.worlds import ARCADE, CONTINUOUS, WORLDS, find_world
-from mbagent.analysis.folders import check_run, open_folder, write_csv
-from mbagent.analysis.parallel import run_all
-from mbagent.analysis.statistics import interquartile_interval
+from harness import check_run, open_folder, run_all, write_csv
+from mbagent.evaluation.statistics import interquartile_interval
+from studies.external.experiment import AGENTS, TRUE, Row, Task, run_task
+from worlds.environments import ARCADE, CONTINUOUS, WORLDS, find_world
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,10 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
+from harness import check_run, open_folder, run_all
 from mbagent import files
-from mbagent.analysis.folders import check_run, open_folder
-from mbagent.analysis.forecasts.experiment import CASES, Outcome, Return, Score, Settings, plan, run_task, save_csv
-from mbagent.analysis.forecasts.page import write_page
-from mbagent.analysis.parallel import run_all
+from studies.forecasting.experiment import CASES, Outcome, Return, Score, Settings, plan, run_task, save_csv
+from studies.forecasting.page import write_page
 
 QUICK_STEPS, FULL_STEPS = (1, 2, 4, 8, 15), tuple(range(1, 16))
 

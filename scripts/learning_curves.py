@@ -23,11 +23,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from harness import check_run, open_folder, run_all, write_csv
 from mbagent import files
-from mbagent.analysis.external.curves import PLAYERS, Course, Row, draw_curves, run_course
-from mbagent.analysis.external.worlds import find_world
-from mbagent.analysis.folders import check_run, open_folder, write_csv
-from mbagent.analysis.parallel import run_all
+from studies.learning.curves import PLAYERS, Course, Row, draw_curves, run_course
+from worlds.environments import find_world
 
 QUICK, FULL = (1000, 5000), (10_000, 30_000, 100_000)
 

@@ -26,12 +26,11 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from harness import check_run, open_folder, run_all, write_csv
 from mbagent import files
-from mbagent.analysis.folders import check_run, open_folder, write_csv
-from mbagent.analysis.model_accuracy.experiment import CASES, Outcome, Score, Settings, means, plan, run_task
-from mbagent.analysis.model_accuracy.page import averaged, shown, write_page
-from mbagent.analysis.model_accuracy.studies import STUDIES, Study, parts
-from mbagent.analysis.parallel import run_all
+from studies.model_accuracy.experiment import CASES, Outcome, Score, Settings, means, plan, run_task
+from studies.model_accuracy.page import averaged, shown, write_page
+from studies.model_accuracy.studies import STUDIES, Study, parts
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,11 @@ from pathlib import Path
 import tyro
 from rich.console import Console
 
+from harness import check_run, open_folder, run_all, write_csv
 from mbagent import files
-from mbagent.analysis.folders import check_run, open_folder, write_csv
-from mbagent.analysis.parallel import run_all
-from mbagent.analysis.pruning.experiment import FRACTIONS, GAMES, Networks, Outcome, Settings, Way, plan, run_task
-from mbagent.analysis.pruning.measures import measure_size
-from mbagent.analysis.pruning.page import summary_rows, write_page
+from studies.pruning.experiment import FRACTIONS, GAMES, Networks, Outcome, Settings, Way, plan, run_task
+from studies.pruning.measures import measure_size
+from studies.pruning.page import summary_rows, write_page
 
 SIZES = (16, 32, 64, 128)
 """Numbers of variables."""

@@ -22,9 +22,10 @@ from typing import Literal, get_args
 import tyro
 from rich.console import Console
 
-from mbagent.analysis.accuracy.experiment import FIRST_SCORED_SEED, Outcome, Part, Settings, Task, collect, plan, run_task
-from mbagent.analysis.accuracy.page import write_page
-from mbagent.analysis.accuracy.results import (
+from harness import check_run, open_folder, run_all
+from studies.sampling_accuracy.experiment import FIRST_SCORED_SEED, Outcome, Part, Settings, Task, collect, plan, run_task
+from studies.sampling_accuracy.page import write_page
+from studies.sampling_accuracy.results import (
     Points,
     first_points,
     load_points,
@@ -34,11 +35,9 @@ from mbagent.analysis.accuracy.results import (
     save_scores,
     save_settings,
 )
-from mbagent.analysis.accuracy.samplers import FitOptions
-from mbagent.analysis.accuracy.scores import Score
-from mbagent.analysis.accuracy.trials import TRIALS
-from mbagent.analysis.folders import check_run, open_folder
-from mbagent.analysis.parallel import run_all
+from studies.sampling_accuracy.samplers import FitOptions
+from studies.sampling_accuracy.scores import Score
+from studies.sampling_accuracy.trials import TRIALS
 
 QUICK_TRIALS = tuple(trial.name for trial in TRIALS if trial.options.d <= 8)
 

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from mbagent.analysis.planning_benchmark.crowds import IndependentModel
 from mbagent.models import SimulatorModel
 from mbagent.models.base import Actions, BaseTransitionModel, States, Successors
 from mbagent.models.reachable import ReachableMDP, grow_reachable
@@ -12,6 +11,7 @@ from mbagent.planning.planner import PlannerSettings
 from mbagent.planning.value_iteration import MOST_SAMPLES, Machine, solve
 from mbagent_envs.geyser_runner import GeyserRunner
 from tests.worlds import TableWorld, arrival_goal, optimal_q, random_table
+from worlds.coupled import IndependentModel
 
 
 @pytest.mark.parametrize("seed", range(5))

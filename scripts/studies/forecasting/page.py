@@ -1,0 +1,122 @@
+"""The figure and the page that the experiment ends in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from mbagent import files
+from mbagent.evaluation.report import FIGURE_STYLE, render, to_png
+from mbagent.evaluation.statistics import Interval, mean_interval
+from studies import TEMPLATES
+from studies.forecasting.experiment import CASES, Method, Outcome, Return, Score, Settings
+
+MEASURES: dict[str, str] = {
+    "joint": "total variation of the joint distribution",
+    "inexact": "share of draws that are not the next state",
+    "marginal": "total variation of single variables",
+}
+"""Fields of a score, the most telling first."""
+
+_LOOKS: dict[Method, tuple[str, str, str]] = {
+    "iterated": ("one-step model, iterated", "#00798c", "o"),
+    "direct": ("a model for each n", "#d1495b", "s"),
+    "true again": ("a second set of true draws", "#9aa3ad", ""),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """Errors at n steps, by method: the case's measure, and single variables; and the direct model's fit, in seconds."""
+
+    n: int
+    errors: dict[Method, Interval]
+    marginals: dict[Method, Interval]
+    fit_seconds: float
+
+
+@dataclass(frozen=True)
+class Table:
+    """One game's errors."""
+
+    name: str
+    measure: str
+    rows: list[Row]
+    seeds: int
+    returns: dict[str, Interval]
+
+
+def tables(scores: Sequence[Score], returns: Sequence[Return]) -> list[Table]:
+    """A table for each game that was measured."""
+    found = []
+    for case in CASES:
+        mine = [score for score in scores if score.case == case.name]
+        if not mine:
+            continue
+        measure = next(name for name in MEASURES if all(np.isfinite(getattr(score, name)) for score in mine))
+        rows = [_row([score for score in mine if score.n == n], n, measure) for n in sorted({score.n for score in mine})]
+        played = [r for r in returns if r.case == case.name]
+        means = {kind: mean_interval(r.value for r in played if r.forecasts == kind) for kind in ("iterated", "direct")}
+        found.append(Table(case.name, measure, rows, len({score.seed for score in mine}), means if played else {}))
+    return found
+
+
+def _row(scores: Sequence[Score], n: int, measure: str) -> Row:
+    def mean(method: Method, field: str) -> Interval:
+        return mean_interval(getattr(score, field) for score in scores if score.method == method)
+
+    errors = {method: mean(method, measure) for method in _LOOKS}
+    marginals = {method: mean(method, "marginal") for method in _LOOKS}
+    return Row(n, errors, marginals, mean("direct", "fit_seconds").estimate)
+
+
+def write_page(path: Path, outcomes: Sequence[Outcome], settings: Settings, command: str) -> bytes:
+    """Writes the HTML page, picture and all, into one file; returns the picture as PNG."""
+    found = tables([s for o in outcomes for s in o.scores], [r for o in outcomes for r in o.returns])
+    figure = draw_errors(found)
+    page = render(
+        TEMPLATES / "forecasts.html.jinja", tables=found, measures=MEASURES, figure=figure, settings=settings, command=command
+    )
+    files.write(path, page)
+    return figure
+
+
+def draw_errors(found: Sequence[Table]) -> bytes:
+    """Error against the number of steps, one panel a game."""
+    columns = min(2, len(found))
+    lines = -(-len(found) // columns)
+    with mpl.rc_context(FIGURE_STYLE):
+        figure = Figure(figsize=(4.8 * columns, 3.2 * lines), layout="constrained")
+        grid = figure.subplots(lines, columns, squeeze=False)
+        for axes in grid.flat[len(found) :]:
+            axes.set_visible(False)
+        for axes, table in zip(grid.flat, found, strict=False):
+            _draw_panel(axes, table)
+        handles, labels = grid.flat[0].get_legend_handles_labels()
+        for axes in grid.flat[: len(found)]:
+            more = axes.get_legend_handles_labels()
+            if len(more[0]) > len(handles):
+                handles, labels = more
+        figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
+        return to_png(figure)
+
+
+def _draw_panel(axes: Axes, table: Table) -> None:
+    steps = [row.n for row in table.rows]
+    for method, (label, colour, marker) in _LOOKS.items():
+        if method == "true again" and table.measure != "marginal":
+            continue  # zero by definition
+        cells = [row.errors[method] for row in table.rows]
+        axes.plot(steps, [c.estimate for c in cells], color=colour, marker=marker or None, markersize=4, label=label)
+        low, high = [max(c.low, 0.0) for c in cells], [min(c.high, 1.0) for c in cells]  # every measure is a share
+        axes.fill_between(steps, low, high, color=colour, alpha=0.15, linewidth=0)
+    axes.set_title(table.name, loc="left")
+    axes.set_ylabel(MEASURES[table.measure], fontsize=8)
+    axes.set_xlabel("steps ahead n")
+    axes.set_ylim(bottom=0.0)

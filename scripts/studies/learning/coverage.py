@@ -1,0 +1,168 @@
+"""How soon exploration has tried everything, and how wrong the model is by then, in worlds whose rules are known."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from exact import Exact
+from mbagent.agent import ModelLearningAgent
+from mbagent.evaluation.report import FIGURE_STYLE, to_png
+from mbagent.models.base import Actions, States, Successors, TransitionModel
+from mbagent.spaces import FactoredSpace
+from worlds.distractors import BesideWorld
+from worlds.environments import World, exact_world, true_model
+
+Row = dict[str, Any]
+
+MAX_PAIRS = 400
+"""Model error is measured on so many reachable (state, action), drawn once."""
+
+MAX_OUTCOMES = 1 << 14
+"""More outcomes of a (state, action) than any world here has."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """One exploration in one world with one seed.
+
+    Attributes:
+        world: where; its rules must be known.
+        exploration: the agent's argument.
+        seed: of the agent and the world.
+        marks: environment steps after which to measure, ascending; the model is fitted anew at each.
+    """
+
+    world: World | BesideWorld
+    exploration: str
+    seed: int
+    marks: tuple[int, ...]
+
+
+def reachable(exact: Exact) -> NDArray[np.int64]:
+    """Numbers of the states in which an episode can be under way."""
+    steps = (exact.going > 0).any(axis=1)
+    met = exact.start > 0
+    while (more := met | (met @ steps)).sum() > met.sum():
+        met = more
+    return np.flatnonzero(met)
+
+
+def outcomes(world: World, exact: Exact, numbers: NDArray[np.int64], actions: Actions) -> Successors:
+    """What the true rules say of states [N], by their numbers, and actions [N]: every outcome with its probability.
+
+    Raises:
+        ValueError: the world's rules are not known.
+    """
+    space = FactoredSpace(world.make().observation_space)
+    states = space.encode(exact.observations)
+    if world.kind == "rddl":  # no episode ends before its time
+        rows, following = np.nonzero(exact.going[numbers, actions])
+        offsets = np.searchsorted(rows, np.arange(len(numbers) + 1)).astype(np.int64)
+        chances = exact.going[numbers, actions][rows, following]
+        return Successors(offsets, states[following], np.zeros(len(rows), dtype=np.bool_), chances)
+    known = true_model(world)
+    if known is None:
+        raise ValueError(f"The true rules of {world.name} are not at hand.")
+    return known[0].successors(states[numbers], actions, MAX_OUTCOMES, 0)
+
+
+def wrongness(model: TransitionModel, truth: Successors, states: States, actions: Actions) -> float:
+    """Mean total variation between what a model says of (state, action) [N] and all their true outcomes."""
+    rows = truth.rows
+    said = np.exp(model.log_prob(states[rows], actions[rows], truth.states, truth.terminated))
+    shared = np.bincount(rows, weights=np.minimum(said, truth.probabilities), minlength=len(states))
+    return float(1.0 - shared.mean())
+
+
+def run_study(study: Study) -> list[Row]:
+    """Explores and fits from mark to mark; a row for each. There is no return where a world has no reward.
+
+    Raises:
+        ValueError: the world's rules are not known.
+    """
+    agent = ModelLearningAgent("MctsPolicy", study.world.make(), seed=study.seed, exploration=study.exploration)
+    figures = _beside(study.world, agent) if isinstance(study.world, BesideWorld) else _exactly(study.world, agent)
+    rows: list[Row] = []
+    for mark in study.marks:
+        began = time.process_time()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that the reward is learned, or there is none
+            agent.learn(mark - agent.num_timesteps, log_interval=None, reset_num_timesteps=False)
+        row = {"world": study.world.name, "exploration": study.exploration, "seed": study.seed, "steps": mark}
+        rows.append(row | figures() | {"learn_seconds": time.process_time() - began})
+    return rows
+
+
+def _exactly(world: World, agent: ModelLearningAgent) -> Callable[[], Row]:
+    """What measures an agent in a world that is known as tables."""
+    exact = exact_world(world)
+    if exact is None:
+        raise ValueError(f"The true rules of {world.name} are not at hand.")
+    n_actions, states = agent.policy.actions.n, agent.policy.factored.encode(exact.observations)
+    pairs = _pairs(reachable(exact), n_actions)
+    some = pairs[np.random.default_rng(0).permutation(len(pairs))[:MAX_PAIRS]]
+    truth = outcomes(world, exact, some[:, 0], some[:, 1])
+
+    def figures() -> Row:
+        met = agent.transitions.rows()
+        tried = np.unique(np.column_stack([met.before, met.actions]), axis=0)
+        span = exact.best() - exact.random()
+        actions = agent.predict(exact.observations, deterministic=True)[0]
+        return {
+            "tried": len(tried) / len(pairs),
+            "error": wrongness(agent.model, truth, states[some[:, 0]], some[:, 1]),
+            "normalised": (exact.of(agent.policy.actions.encode(actions)) - exact.random()) / span,
+        }
+
+    return figures
+
+
+def _beside(world: BesideWorld, agent: ModelLearningAgent) -> Callable[[], Row]:
+    """What measures an agent in a world that was made up."""
+    pairs = _pairs(world.known.reachable(), agent.policy.actions.n)
+    some = pairs[np.random.default_rng(0).permutation(len(pairs))[:MAX_PAIRS]]
+
+    def figures() -> Row:
+        met = agent.transitions.rows()
+        error = world.wrongness(agent.model, some[:, 0], some[:, 1])
+        return {"tried": world.tried(met.states, met.actions), "error": error, "normalised": float("nan")}
+
+    return figures
+
+
+def _pairs(numbers: NDArray[np.int64], n_actions: int) -> NDArray[np.int64]:
+    """Every (state, action), int64 [N, 2]."""
+    return np.stack([part.ravel() for part in np.meshgrid(numbers, np.arange(n_actions), indexing="ij")], axis=1)
+
+
+def draw_coverage(rows: Sequence[Row]) -> bytes:
+    """A column for each world: share of pairs tried, and model error, against steps; a line for each seed. A PNG."""
+    worlds = list(dict.fromkeys(row["world"] for row in rows))
+    kinds = list(dict.fromkeys(row["exploration"] for row in rows))
+    with mpl.rc_context(FIGURE_STYLE):
+        figure = Figure(figsize=(2.6 * len(worlds) + 1.0, 5.2), layout="constrained")
+        grid = figure.subplots(2, len(worlds), squeeze=False, sharex="col")
+        for column, world in enumerate(worlds):
+            for axes, name in zip(grid[:, column], ("tried", "error"), strict=True):
+                for line in sorted({(row["exploration"], row["seed"]) for row in rows if row["world"] == world}):
+                    own = [row for row in rows if (row["world"], row["exploration"], row["seed"]) == (world, *line)]
+                    colour = f"C{kinds.index(line[0])}"
+                    axes.plot([row["steps"] for row in own], [row[name] for row in own], color=colour, marker=".")
+                axes.set_xscale("log")
+                axes.set_ylim(0.0, None)
+            grid[0, column].set_title(world)
+            grid[1, column].set_xlabel("environment steps")
+        grid[0, 0].set_ylabel("share of (state, action) tried")
+        grid[1, 0].set_ylabel("model error (total variation)")
+        handles = [mpl.lines.Line2D([], [], color=f"C{i}", label=kind) for i, kind in enumerate(kinds)]
+        figure.legend(handles=handles, loc="outside lower center", ncols=len(kinds), frameon=False)
+        return to_png(figure)

@@ -1,0 +1,130 @@
+"""Learning curves: one agent in one world, played after some numbers of environment steps."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import gymnasium as gym
+import matplotlib as mpl
+import torch
+from matplotlib.figure import Figure
+
+from mbagent.agent import ModelLearningAgent
+from mbagent.evaluation.baselines import BaselineName, as_policy, train_baseline
+from mbagent.evaluation.evaluate import Policy, evaluate_env, random_policy
+from mbagent.evaluation.report import FIGURE_STYLE, to_png
+from worlds.environments import World, for_networks
+
+Row = dict[str, Any]
+
+OURS, RANDOM = "mbagent", "random"
+PLAYERS = (OURS, "PPO", "DQN", RANDOM)
+
+
+@dataclass(frozen=True)
+class Course:
+    """What is learned and when it is looked at.
+
+    Attributes:
+        world: where.
+        agent: one of PLAYERS.
+        seed: of learning and play.
+        marks: environment steps after which to play, ascending.
+        episodes: to play each time, the same for all agents.
+    """
+
+    world: World
+    agent: str
+    seed: int
+    marks: tuple[int, ...]
+    episodes: int
+
+
+def run_course(course: Course) -> list[Row]:
+    """Learns from mark to mark; a row for each."""
+    torch.set_num_threads(1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that the reward is learned, and of packages around
+        if course.agent == OURS:
+            return _ours(course)
+        if course.agent == RANDOM:
+            space = course.world.make().action_space
+            assert isinstance(space, gym.spaces.Discrete)
+            return [_row(course, course.marks[-1], random_policy(int(space.n), course.seed), False, 0.0)]
+        return _baseline(course)
+
+
+def _row(course: Course, steps: int, policy: Policy, repeatable: bool, seconds: float) -> Row:
+    began = time.perf_counter()
+    played = evaluate_env(course.world.make, policy, episodes=course.episodes, seed=course.seed, repeatable=repeatable)
+    returns = played.default
+    return {
+        "world": course.world.name,
+        "agent": course.agent,
+        "seed": course.seed,
+        "steps": steps,
+        "return": float(returns.mean()),
+        "error": float(returns.std(ddof=1) / len(returns) ** 0.5) if len(returns) > 1 else float("nan"),
+        "episodes": len(returns),
+        "learn_seconds": seconds,
+        "play_seconds": time.perf_counter() - began,
+    }
+
+
+def _ours(course: Course) -> list[Row]:
+    agent, rows, seconds = ModelLearningAgent("MctsPolicy", course.world.make(), seed=course.seed), [], 0.0
+    for mark in course.marks:
+        began = time.perf_counter()
+        agent.learn(mark - agent.num_timesteps, log_interval=None, reset_num_timesteps=False)
+        seconds += time.perf_counter() - began
+        rows.append(_row(course, mark, as_policy(agent), True, seconds))
+    return rows
+
+
+def _baseline(course: Course) -> list[Row]:
+    """One training for each mark, so that all schedules end there; of likeliest and drawn actions the better count."""
+    rows = []
+    for mark in course.marks:
+        began = time.perf_counter()
+        name = cast("BaselineName", course.agent)
+        algorithm, _ = train_baseline(
+            name,
+            lambda: for_networks(course.world.make()),
+            steps=mark,
+            seed=course.seed,
+            evaluate=lambda policy, repeatable: 0.0,
+            points=1,
+        )
+        seconds = time.perf_counter() - began
+        both = [_row(course, mark, as_policy(algorithm, deterministic=likely), likely, seconds) for likely in (True, False)]
+        rows.append(max(both, key=lambda row: float(row["return"])))
+    return rows
+
+
+def draw_curves(rows: Sequence[Row]) -> bytes:
+    """A panel for each world: mean return against environment steps, a line for each agent and seed. A PNG."""
+    worlds = list(dict.fromkeys(row["world"] for row in rows))
+    with mpl.rc_context(FIGURE_STYLE):
+        figure = Figure(figsize=(3.4 * len(worlds) + 1.0, 3.2), layout="constrained")
+        for axes, world in zip(figure.subplots(1, len(worlds), squeeze=False)[0], worlds, strict=True):
+            for agent, seed in sorted({(row["agent"], row["seed"]) for row in rows if row["world"] == world}):
+                own = [row for row in rows if (row["world"], row["agent"], row["seed"]) == (world, agent, seed)]
+                own.sort(key=lambda row: int(row["steps"]))
+                colour = f"C{PLAYERS.index(agent)}"
+                if agent == RANDOM:
+                    axes.axhline(own[0]["return"], color=colour, linestyle=":")
+                else:
+                    steps, values, errors = ([row[name] for row in own] for name in ("steps", "return", "error"))
+                    axes.errorbar(steps, values, errors, color=colour, marker=".", capsize=2)
+            axes.set_title(world)
+            axes.set_xlabel("environment steps")
+            axes.set_xscale("log")
+        figure.axes[0].set_ylabel("return")
+        agents = [name for name in PLAYERS if any(row["agent"] == name for row in rows)]
+        handles = [mpl.lines.Line2D([], [], color=f"C{PLAYERS.index(name)}", label=name) for name in agents]
+        figure.legend(handles=handles, loc="outside lower center", ncols=len(agents), frameon=False)
+        return to_png(figure)

@@ -1,0 +1,118 @@
+"""How well agents play: with the true model, and with a learned one, against the optimum or the best player known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from mbagent.agent import ModelLearningAgent
+from mbagent.evaluation.baselines import as_policy
+from mbagent.evaluation.statistics import interquartile_interval, normalised
+from mbagent.models.base import Floats
+from mbagent.models.simulator import SimulatorModel
+from mbagent.models.table import toy_text_model
+from worlds.games import Scale, find_case, finite_horizon_value, game_of, measure_scale, play
+
+Row = dict[str, Any]
+
+GAMES = ("geyser_deterministic", "geyser_low_cost", "geyser_high_cost", "flier_catcher", "maneuverer")
+"""Cases that are games."""
+
+TOY_TEXT: dict[str, tuple[str, int, dict[str, Any]]] = {
+    "FrozenLake 4x4": ("FrozenLake-v1", 100, {"map_name": "4x4"}),
+    "FrozenLake 8x8": ("FrozenLake-v1", 100, {"map_name": "8x8"}),
+    "CliffWalking": ("CliffWalking-v1", 200, {}),
+    "Taxi": ("Taxi-v4", 200, {}),
+}
+"""Gymnasium's tables: id, steps of an episode, further arguments."""
+
+EPISODES, SCALE_EPISODES, STEPS = 20, 300, 50_000
+"""Episodes of a seed; episodes that the scale is measured with; steps learned from."""
+
+
+@dataclass(frozen=True)
+class Played:
+    """Normalised returns of one agent.
+
+    Attributes:
+        world: its name.
+        model: "true" or "learned".
+        seed: of the agent.
+        scores: normalised return of each episode; of a table, of its exact value.
+        value: mean return.
+        reference: return that counts as 1.
+    """
+
+    world: str
+    model: str
+    seed: int
+    scores: Floats
+    value: float
+    reference: float
+
+
+def play_table(name: str, seed: int) -> Played:
+    """Plays a table with its true model; the value of what the agent does is computed exactly."""
+    env_id, limit, kwargs = TOY_TEXT[name]
+    env = gym.make(env_id, max_episode_steps=limit, **kwargs)
+    model, reward = toy_text_model(env)
+    agent = ModelLearningAgent("MctsPolicy", env, model=model, reward=reward, seed=seed)
+    actions, _ = agent.predict(np.arange(model.cardinalities[0]))
+    value = value_of(env, np.asarray(actions), limit)
+    low, high = finite_horizon_value(env, best=False), finite_horizon_value(env, best=True)
+    return Played(name, "true", seed, np.asarray(normalised([value], low, high)), value, high)
+
+
+def value_of(env: gym.Env[Any, Any], actions: np.ndarray, limit: int) -> float:
+    """Expected return of the behaviour that takes ``actions`` [S], within so many steps."""
+    unwrapped: Any = env.unwrapped
+    table, v = unwrapped.P, np.zeros(len(actions))
+    for _ in range(limit):
+        v = np.array(
+            [sum(p * (r + (0.0 if over else v[n])) for p, n, r, over in table[s][int(actions[s])]) for s in range(len(actions))]
+        )
+    return float(np.asarray(unwrapped.initial_state_distrib) @ v)
+
+
+def play_game(key: str, seed: int, learned: bool, scale: Scale, episodes: int = EPISODES, steps: int = STEPS) -> Played:
+    """Plays a game with its true model, or with one learned from ``steps`` steps, by the agent's default settings."""
+    case, game = find_case(key), game_of(find_case(key))
+    assert game is not None
+    if learned:
+        agent = ModelLearningAgent("MctsPolicy", case.make_env(), seed=seed).learn(steps, log_interval=None)
+    else:
+        agent = ModelLearningAgent("MctsPolicy", case.make_env(), model=SimulatorModel(game), seed=seed)
+    returns = play(case, as_policy(agent), episodes=episodes, seed=seed, repeatable=True).default
+    scores = np.asarray(normalised(returns, scale.random, scale.reference))
+    return Played(key, "learned" if learned else "true", seed, scores, float(returns.mean()), scale.reference)
+
+
+def scales(say: Callable[[str], None]) -> dict[str, Scale]:
+    """Scales of all games."""
+    found = {}
+    for key in GAMES:
+        say(f"scale of {key}")
+        found[key] = measure_scale(find_case(key), episodes=SCALE_EPISODES)
+    return found
+
+
+def summary(played: list[Played]) -> Row:
+    """One world's and model's agents in a row."""
+    first = played[0]
+    scores = np.stack([agent.scores for agent in played])
+    interval = interquartile_interval(scores)
+    return {
+        "world": first.world,
+        "model": first.model,
+        "seeds": len(played),
+        "episodes": scores.size,
+        "normalised": interval.estimate,
+        "low": interval.low,
+        "high": interval.high,
+        "return": float(np.mean([agent.value for agent in played])),
+        "reference": first.reference,
+    }

@@ -1,0 +1,119 @@
+"""The worlds' rules by hand, what counts as certain, and a whole small run."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mbagent.models import SimulatorModel
+from mbagent_envs import GeyserRunner, Maneuverer
+from mbagent_envs.random_keys import derive
+from model_accuracy import main
+from studies.model_accuracy.experiment import (
+    CASES,
+    certain_factors,
+    joint_variation,
+    likeliest_states,
+    random_play,
+)
+from worlds.board_games import BoardWorld, PushedBox, Switch, TwoPlayers
+
+UP, RIGHT, DOWN, LEFT = range(4)
+
+
+def board(world: BoardWorld, *things: tuple[int, int, int]) -> np.ndarray:
+    """A state with bits on at (plane, row, column)."""
+    obs = world.blank(1)
+    for plane, row, column in things:
+        world.planes(obs)[0, plane, row * world.size + column] = 1
+    return obs
+
+
+def after(world: BoardWorld, obs: np.ndarray, action: int, plane: int) -> set[tuple[int, int]]:
+    """Cells of a plane that are on after a step."""
+    following = world.transition(obs, np.array([action]), derive(1, np.arange(1)))
+    return {(int(c) // world.size, int(c) % world.size) for c in np.flatnonzero(world.planes(following)[0, plane])}
+
+
+def test_two_players_move_together_and_walls_stop_each() -> None:
+    world = TwoPlayers()
+    obs = board(world, (0, 2, 2), (0, 4, 0), (1, 2, 3), (2, 5, 5))
+    assert after(world, obs, RIGHT, 0) == {(2, 2), (4, 1)}
+    assert after(world, obs, LEFT, 0) == {(2, 1), (4, 0)}
+    assert after(world, obs, RIGHT, 1) == {(2, 3)}
+    assert world.over(board(world, (0, 1, 1), (0, 3, 3), (2, 3, 3)))[0]
+    assert not world.over(obs)[0]
+
+
+def test_a_box_is_pushed_where_there_is_room_behind_it() -> None:
+    world = PushedBox()
+    obs = board(world, (0, 2, 1), (2, 2, 2))
+    assert (after(world, obs, RIGHT, 0), after(world, obs, RIGHT, 2)) == ({(2, 2)}, {(2, 3)})
+    assert (after(world, obs, UP, 0), after(world, obs, UP, 2)) == ({(1, 1)}, {(2, 2)})
+    for blocked in (board(world, (0, 2, 1), (2, 2, 2), (1, 2, 3)), board(world, (0, 2, 4), (2, 2, 5))):
+        player = {(int(c) // 6, int(c) % 6) for c in np.flatnonzero(world.planes(blocked)[0, 0])}
+        assert after(world, blocked, RIGHT, 0) == player
+    assert world.over(board(world, (0, 2, 2), (2, 0, 5)))[0]
+    starts = world.initial(derive(3, np.arange(500)))
+    assert (world.planes(starts)[:, [0, 2]].sum(axis=2) == 1).all()
+    assert not (world.planes(starts)[:, 0] & world.planes(starts)[:, 2]).any()
+
+
+def test_walls_block_only_while_the_switch_is_off() -> None:
+    world = Switch()
+    obs = board(world, (0, 2, 2), (1, 2, 3), (2, 0, 0))
+    assert after(world, obs, RIGHT, 0) == {(2, 2)}
+    obs[:, -1] = 1
+    assert after(world, obs, RIGHT, 0) == {(2, 3)}
+    many = np.repeat(obs, 4000, axis=0)
+    flipped = world.transition(many, np.full(4000, UP), derive(2, np.arange(4000)))[:, -1] == 0
+    assert abs(flipped.mean() - 0.1) < 5 * np.sqrt(0.09 / 4000)
+
+
+def test_only_what_is_not_random_is_judged() -> None:
+    geysers = SimulatorModel(GeyserRunner())
+    order = np.random.default_rng(1).permutation(15)
+    rows = random_play(GeyserRunner(), 300, 1, order)
+    certain = certain_factors(geysers, rows, order, 1)
+    assert not certain.any()  # a third of the factors, where the geyser is, is random
+    maze = SimulatorModel(Maneuverer())
+    rows = random_play(Maneuverer(), 1000, 1, np.arange(108))
+    certain = certain_factors(maze, rows, np.arange(108), 1)
+    new_layouts = (rows.states[:, :36] & rows.states[:, 72:]).any(axis=1)
+    assert new_layouts.any()
+    np.testing.assert_array_equal(certain.all(axis=1), ~new_layouts)
+
+
+def test_the_true_model_makes_no_mistake() -> None:
+    game = GeyserRunner(mode="deterministic")
+    true, order = SimulatorModel(game), np.arange(15)
+    rows = random_play(game, 500, 2, order)
+    assert joint_variation(true, true, rows, order) == pytest.approx(0.0)
+    np.testing.assert_array_equal(likeliest_states(true, rows), rows.next_states)
+    assert len(np.unique(rows.episodes)) == 5
+
+
+def test_a_small_run_is_written_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cases = ["GeyserRunner, deterministic", "GeyserRunner, stochastic"]
+    options = ["--cases", *cases, "--models", "graphs", "--steps", "1000", "--n-tests", "500", "--studies"]
+    assert main([*options, "--workers", "1", "--output", str(tmp_path)]) == 0
+    assert len((tmp_path / "results.csv").read_text(encoding="utf-8").splitlines()) == 3
+    assert "100.00%" in capsys.readouterr().out
+    assert len(CASES) == 9
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        (["--cases", "Chess"], "no case 'Chess'"),
+        (["--models"], "at least one model"),
+        (["--studies", "all"], "no study 'all'"),
+        (["--models", "none"], "no model called 'none'"),
+        (["--steps", "5"], "must be 100 or more"),
+        (["--seeds", "0"], "seeds must be at least 1"),
+        (["--workers", "0"], "at least 1 process"),
+    ],
+)
+def test_mistakes_get_one_sentence(wrong: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*wrong, "--output", str(tmp_path / "new")]) == 1
+    assert told in capsys.readouterr().out.replace("\n", " ")
