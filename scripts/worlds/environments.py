@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import DiscretizeObservation, TransformObservation
 
-from exact import Exact, exact_rddl, exact_toy_text
+from exact import FiniteHorizonMDP, toy_text_mdp
 from mbagent.adapters.minatar import make_minatar
 from mbagent.adapters.minigrid import make_minigrid
 from mbagent.adapters.rddl import RddlEnv
@@ -131,16 +131,16 @@ def tables_of(target: str) -> RddlTables:
     return rddl_tables(RddlEnv(target))
 
 
-def exact_world(world: World) -> Exact | None:
+def exact_world(world: World) -> FiniteHorizonMDP | None:
     """A world as tables; None where its rules are not at hand."""
     if world.kind in ("toy_text", "planes"):
-        return exact_toy_text(world.make())
+        return toy_text_mdp(world.make())
     return _exact_rddl(world.target) if world.kind == "rddl" else None
 
 
 @cache
-def _exact_rddl(target: str) -> Exact:
-    return exact_rddl(tables_of(target), RddlEnv(target).rddl.horizon)
+def _exact_rddl(target: str) -> FiniteHorizonMDP:
+    return tables_of(target).mdp(RddlEnv(target).rddl.horizon)
 
 
 def true_model(world: World) -> tuple[TransitionModel, RewardFn] | None:
@@ -165,7 +165,7 @@ def scale_of(world: World) -> Scale:
     """Returns of random play and of the best: exact where rules are known; else random play is measured, the best not known."""
     known = exact_world(world)
     if known is not None:
-        return Scale(known.random(), known.best())
+        return Scale(known.random_return(), known.optimal_return())
     space = world.make().action_space
     assert isinstance(space, gym.spaces.Discrete)
     chance = random_policy(int(space.n), seed=1)

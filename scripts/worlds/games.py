@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
-from numpy.typing import NDArray
 
 import mbagent_envs  # noqa: F401  (registers the games)
+from exact import toy_text_mdp
 from mbagent.evaluation.evaluate import Evaluation, Policy, evaluate_env, evaluate_game, random_policy
 from mbagent_envs.game import Game
 from mbagent_envs.references import reference_policy
@@ -196,8 +195,8 @@ def measure_scale(case: Case, goal: str = "default", episodes: int = 1000) -> Sc
     """Measures a goal's scale over many episodes, or computes it exactly from a toy_text table."""
     game = game_of(case)
     if game is None:
-        env = case.make_env()
-        return Scale(finite_horizon_value(env, best=False), finite_horizon_value(env, best=True))
+        known = toy_text_mdp(case.make_env())
+        return Scale(known.random_return(), known.optimal_return())
     seed = 1_000_000  # not the episodes that the agents are scored on
     chance = random_policy(int(game.action_space.n))
     # Random play is quick, and its returns vary most.
@@ -207,33 +206,3 @@ def measure_scale(case: Case, goal: str = "default", episodes: int = 1000) -> Sc
         return Scale(float(low), float("nan"))
     high = play(case, best, episodes=episodes, seed=seed, goals=(goal,), repeatable=True).returns[goal].mean()
     return Scale(float(low), float(high))
-
-
-def finite_horizon_value(env: gym.Env[Any, Any], *, best: bool) -> float:
-    """Expected return of a toy_text environment within its step limit, by backward induction.
-
-    Args:
-        env: an environment with ``unwrapped.P[state][action] -> [(probability, next state, reward,
-            terminated)]``, ``unwrapped.initial_state_distrib`` and a step limit.
-        best: the best possible return; else that of uniformly random play.
-
-    Raises:
-        ValueError: it has no step limit.
-    """
-    if env.spec is None or env.spec.max_episode_steps is None:
-        raise ValueError("The environment has no step limit; give gym.make max_episode_steps.")
-    unwrapped: Any = env.unwrapped
-    table = unwrapped.P
-    n_states, n_actions = len(table), len(table[0])
-    transitions = np.zeros((n_states, n_actions, n_states))
-    rewards = np.zeros((n_states, n_actions))
-    for state in range(n_states):
-        for action in range(n_actions):
-            for probability, following, reward, terminated in table[state][action]:
-                rewards[state, action] += probability * reward
-                transitions[state, action, following] += probability * (not terminated)
-    values: NDArray[np.float64] = np.zeros(n_states)
-    for _ in range(env.spec.max_episode_steps):
-        of_actions = rewards + transitions @ values
-        values = of_actions.max(axis=1) if best else of_actions.mean(axis=1)
-    return float(np.asarray(unwrapped.initial_state_distrib) @ values)

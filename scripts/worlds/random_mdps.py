@@ -10,6 +10,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from exact import optimal_q
+
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]
 Bools: TypeAlias = NDArray[np.bool_]
@@ -64,17 +66,6 @@ class World:
         return lost
 
 
-def exact_q(successors: Ints, probabilities: Floats, rewards: Floats, ends: Bools, gamma: float) -> Floats:
-    """Values float64 [S, A] by value iteration, to machine precision; nothing is earned after a terminated state."""
-    q = np.zeros(successors.shape[:2])
-    while True:
-        worth = rewards + gamma * np.where(ends, 0.0, q.max(axis=1))
-        new: Floats = (probabilities * worth[successors]).sum(axis=2)
-        if np.abs(new - q).max() <= 1e-13 * max(1.0, float(np.abs(new).max())):
-            return new
-        q = new
-
-
 def random_world(kind: Kind, seed: int, n_states: int = N_STATES) -> World:
     """A world of random transitions.
 
@@ -97,7 +88,7 @@ def random_world(kind: Kind, seed: int, n_states: int = N_STATES) -> World:
         some = max(1, n_states // 8)
         rewards[order[:some]] = 1.0
         ends[order[: 2 * some]] = True
-    q = exact_q(successors, probabilities, rewards, ends, GAMMA)
+    q = optimal_q(successors, probabilities, rewards, ends, GAMMA)
     values = np.where(ends, 0.0, q.max(axis=1))
     noise = LEAF_NOISE * values[~ends].std() * rng.normal(size=n_states)
     return World(successors, probabilities, rewards, ends, np.where(ends, 0.0, values + noise), q)

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from exact import FiniteHorizonMDP
 from mbagent.adapters.rddl import RddlEnv, load_rddl
 from mbagent.models.base import Actions, Bools, Floats, Randomness, States, Successors, as_keys
 from mbagent.models.known import KnownModel
@@ -45,6 +46,12 @@ class RddlTables:
         place = np.minimum(np.searchsorted(own, states @ weights, sorter=order), len(own) - 1)
         rows: NDArray[np.int64] = order[place]
         return np.where(own[rows] == states @ weights, rows, -1)
+
+    def mdp(self, horizon: int) -> FiniteHorizonMDP:
+        """The domain with exact values, in episodes of ``horizon`` steps."""
+        start = np.zeros(len(self.states))
+        start[0] = 1.0
+        return FiniteHorizonMDP(self.states.astype(np.int8), self.transitions(), self.rewards, start, horizon)
 
     def transitions(self) -> Floats:
         """P(next | state, action) among the reachable states, float64 [S, A, S]."""

@@ -1,8 +1,6 @@
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from mbagent.evaluation.evaluate import (
@@ -12,7 +10,7 @@ from mbagent.evaluation.evaluate import (
     random_policy,
 )
 from mbagent_envs.game import Game
-from worlds.games import find_case, finite_horizon_value, game_of, goals_of, measure_scale, play
+from worlds.games import find_case, game_of, play
 
 
 def runner(case: str = "geyser_low_cost") -> Game:
@@ -69,30 +67,6 @@ def test_nothing_is_earned_after_termination() -> None:
     # FrozenLake pays at most once, and an episode ends there.
     returns = play(find_case("frozen_lake"), random_policy(4), episodes=200, seed=0).default
     assert set(np.unique(returns)) <= {0.0, 1.0}
-
-
-def test_frozen_lake_has_the_known_scale() -> None:
-    env = gym.make("FrozenLake-v1", map_name="4x4", is_slippery=True)
-    assert finite_horizon_value(env, best=True) == pytest.approx(0.744, abs=5e-4)
-    assert finite_horizon_value(env, best=False) == pytest.approx(0.014, abs=5e-4)
-
-
-def test_a_table_without_a_step_limit_is_refused() -> None:
-    with pytest.raises(ValueError, match="max_episode_steps"):
-        finite_horizon_value(gym.make("CliffWalking-v1"), best=True)
-
-
-def test_scales_are_those_known_for_the_games() -> None:
-    scale = measure_scale(find_case("geyser_high_cost"), episodes=300)
-    assert scale.random == pytest.approx(4.8, abs=1.5)
-    assert scale.reference == pytest.approx(43.8, abs=0.5)
-
-
-def test_unknown_cases_are_named_with_those_there_are() -> None:
-    with pytest.raises(ValueError, match="choose from geyser_deterministic"):
-        find_case("geyser")
-    assert goals_of(find_case("frozen_lake")) == ["default"]
-    assert len(goals_of(find_case("maneuverer"))) >= 4
 
 
 def test_decisions_are_timed_one_by_one() -> None:

@@ -178,7 +178,7 @@ def _played(task: Task, player: Player) -> tuple[np.ndarray, float]:
 def _exact_return(task: Task, player: Player) -> float:
     """Expected return, where the rules are known and the player always does the same; else NaN."""
     known = exact_world(task.world)
-    return known.of(player.policy(known.observations)) if known is not None and player.repeatable else float("nan")
+    return known.policy_return(player.policy(known.observations)) if known is not None and player.repeatable else float("nan")
 
 
 def _met(task: Task, policy: Policy) -> np.ndarray:

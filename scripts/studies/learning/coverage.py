@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from exact import Exact
+from exact import FiniteHorizonMDP
 from mbagent.agent import ModelLearningAgent
 from mbagent.evaluation.report import FIGURE_STYLE, to_png
 from mbagent.models.base import Actions, States, Successors, TransitionModel
@@ -47,16 +47,16 @@ class Study:
     marks: tuple[int, ...]
 
 
-def reachable(exact: Exact) -> NDArray[np.int64]:
+def reachable(exact: FiniteHorizonMDP) -> NDArray[np.int64]:
     """Numbers of the states in which an episode can be under way."""
-    steps = (exact.going > 0).any(axis=1)
+    steps = (exact.transitions > 0).any(axis=1)
     met = exact.start > 0
     while (more := met | (met @ steps)).sum() > met.sum():
         met = more
     return np.flatnonzero(met)
 
 
-def outcomes(world: World, exact: Exact, numbers: NDArray[np.int64], actions: Actions) -> Successors:
+def outcomes(world: World, exact: FiniteHorizonMDP, numbers: NDArray[np.int64], actions: Actions) -> Successors:
     """What the true rules say of states [N], by their numbers, and actions [N]: every outcome with its probability.
 
     Raises:
@@ -65,9 +65,9 @@ def outcomes(world: World, exact: Exact, numbers: NDArray[np.int64], actions: Ac
     space = FactoredSpace(world.make().observation_space)
     states = space.encode(exact.observations)
     if world.kind == "rddl":  # no episode ends before its time
-        rows, following = np.nonzero(exact.going[numbers, actions])
+        rows, following = np.nonzero(exact.transitions[numbers, actions])
         offsets = np.searchsorted(rows, np.arange(len(numbers) + 1)).astype(np.int64)
-        chances = exact.going[numbers, actions][rows, following]
+        chances = exact.transitions[numbers, actions][rows, following]
         return Successors(offsets, states[following], np.zeros(len(rows), dtype=np.bool_), chances)
     known = true_model(world)
     if known is None:
@@ -115,12 +115,12 @@ def _exactly(world: World, agent: ModelLearningAgent) -> Callable[[], Row]:
     def figures() -> Row:
         met = agent.transitions.rows()
         tried = np.unique(np.column_stack([met.before, met.actions]), axis=0)
-        span = exact.best() - exact.random()
+        span = exact.optimal_return() - exact.random_return()
         actions = agent.predict(exact.observations, deterministic=True)[0]
         return {
             "tried": len(tried) / len(pairs),
             "error": wrongness(agent.model, truth, states[some[:, 0]], some[:, 1]),
-            "normalised": (exact.of(agent.policy.actions.encode(actions)) - exact.random()) / span,
+            "normalised": (exact.policy_return(agent.policy.actions.encode(actions)) - exact.random_return()) / span,
         }
 
     return figures

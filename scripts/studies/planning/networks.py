@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from exact import optimal_q
 from mbagent.models.neural import NeuralTransitionModel
 from mbagent.models.packing import pack_dense, pack_groups
 from mbagent.transitions import TransitionBatch, TransitionDataset
@@ -121,12 +122,7 @@ def exact_values(goal: PairwiseGoal, gamma: float) -> tuple[Ints, Floats]:
         following.append(after[:, :, :WIDTH].argmax(axis=2) * half + after[:, :, WIDTH:].argmax(axis=2))
         probabilities.append(chance)
     leads_to, likely = np.stack(following, axis=1), np.stack(probabilities, axis=1)
-    rewards, q = goal(states, number, states), np.zeros(leads_to.shape[:2])
-    while True:
-        new: Floats = (likely * (rewards + gamma * q.max(axis=1))[leads_to]).sum(axis=2)
-        if np.abs(new - q).max() <= 1e-12:
-            return states, new
-        q = new
+    return states, optimal_q(leads_to, likely, goal(states, number, states), None, gamma, tolerance=1e-12)
 
 
 def build_task(seed: int, n_steps: int = 5000) -> NetworkTask:

@@ -9,13 +9,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from exact import toy_text_mdp
 from mbagent.agent import ModelLearningAgent
 from mbagent.evaluation.baselines import as_policy
 from mbagent.evaluation.statistics import interquartile_interval, normalised
 from mbagent.models.base import Floats
 from mbagent.models.simulator import SimulatorModel
 from mbagent.models.table import toy_text_model
-from worlds.games import Scale, find_case, finite_horizon_value, game_of, measure_scale, play
+from worlds.games import Scale, find_case, game_of, measure_scale, play
 
 Row = dict[str, Any]
 
@@ -62,20 +63,9 @@ def play_table(name: str, seed: int) -> Played:
     model, reward = toy_text_model(env)
     agent = ModelLearningAgent("MctsPolicy", env, model=model, reward=reward, seed=seed)
     actions, _ = agent.predict(np.arange(model.cardinalities[0]))
-    value = value_of(env, np.asarray(actions), limit)
-    low, high = finite_horizon_value(env, best=False), finite_horizon_value(env, best=True)
+    known = toy_text_mdp(env)
+    value, low, high = known.policy_return(np.asarray(actions)), known.random_return(), known.optimal_return()
     return Played(name, "true", seed, np.asarray(normalised([value], low, high)), value, high)
-
-
-def value_of(env: gym.Env[Any, Any], actions: np.ndarray, limit: int) -> float:
-    """Expected return of the behaviour that takes ``actions`` [S], within so many steps."""
-    unwrapped: Any = env.unwrapped
-    table, v = unwrapped.P, np.zeros(len(actions))
-    for _ in range(limit):
-        v = np.array(
-            [sum(p * (r + (0.0 if over else v[n])) for p, n, r, over in table[s][int(actions[s])]) for s in range(len(actions))]
-        )
-    return float(np.asarray(unwrapped.initial_state_distrib) @ v)
 
 
 def play_game(key: str, seed: int, learned: bool, scale: Scale, episodes: int = EPISODES, steps: int = STEPS) -> Played:

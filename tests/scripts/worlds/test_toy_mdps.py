@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from exact import exact_toy_text
+from exact import toy_text_mdp
 from worlds.environments import find_world
 from worlds.toy_mdps import TableEnv, deep_sea, inventory
 
@@ -14,7 +14,7 @@ from worlds.toy_mdps import TableEnv, deep_sea, inventory
 def test_they_are_environments(name: str) -> None:
     env = find_world(name).make()
     check_env(env.unwrapped, skip_render_check=True)
-    known = exact_toy_text(env)
+    known = toy_text_mdp(env)
     states = list(known.observations)
     assert all(env.observation_space.contains(state) for state in states if np.ndim(state))
     returns = []
@@ -27,8 +27,8 @@ def test_they_are_environments(name: str) -> None:
             total, over = total + float(reward), terminated or truncated
         returns.append(total)
     error = np.std(returns, ddof=1) / np.sqrt(len(returns))
-    assert abs(np.mean(returns) - known.random()) < 5 * error
-    assert known.best() > known.random() + 10 * error
+    assert abs(np.mean(returns) - known.random_return()) < 5 * error
+    assert known.optimal_return() > known.random_return() + 10 * error
 
 
 def test_an_inventory_sells_what_is_there_and_no_more_than_is_asked_for() -> None:
@@ -44,11 +44,11 @@ def test_an_inventory_sells_what_is_there_and_no_more_than_is_asked_for() -> Non
 
 
 def test_in_deep_sea_only_steps_to_the_right_lead_to_the_treasure() -> None:
-    known = exact_toy_text(gym.make("mbagent/DeepSea-v0", size=6))
-    assert known.best() == pytest.approx(0.99)
-    assert known.random() == pytest.approx(2.0**-6 - 6 * 0.5 * 0.01 / 6)
-    slippery = exact_toy_text(gym.make("mbagent/DeepSea-v0", size=6, slip=0.2))
-    assert 0.8**6 - 0.01 < slippery.best() < 0.8**6
+    known = toy_text_mdp(gym.make("mbagent/DeepSea-v0", size=6))
+    assert known.optimal_return() == pytest.approx(0.99)
+    assert known.random_return() == pytest.approx(2.0**-6 - 6 * 0.5 * 0.01 / 6)
+    slippery = toy_text_mdp(gym.make("mbagent/DeepSea-v0", size=6, slip=0.2))
+    assert 0.8**6 - 0.01 < slippery.optimal_return() < 0.8**6
     env: TableEnv = deep_sea(4)
     seen, _ = env.reset(seed=0)
     for row in range(4):

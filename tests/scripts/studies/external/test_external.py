@@ -8,24 +8,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from exact import exact_toy_text
 from external_benchmark import Args, main, plan
 from studies.external.experiment import IMAGINED, OURS, TRUE, Task, run_task
 from worlds.environments import CONTINUOUS, WORLDS, World, find_world, for_networks, scale_of
-from worlds.games import finite_horizon_value
 
 LAKE = find_world("FrozenLake 4x4")
-
-
-def test_exact_returns_are_those_of_backward_induction_and_of_play() -> None:
-    env = LAKE.make()
-    known = exact_toy_text(env)
-    assert known.best() == pytest.approx(finite_horizon_value(env, best=True))
-    assert known.random() == pytest.approx(finite_horizon_value(env, best=False))
-    cliff = exact_toy_text(find_world("CliffWalking").make())
-    right = np.where(cliff.observations == 36, 0, np.where(cliff.observations % 12 == 11, 2, 1))  # along the cliff's edge
-    assert cliff.best() == cliff.of(right) == -13.0
-    assert cliff.of(np.zeros(48, dtype=np.int64)) == -200.0  # up, and against the border
 
 
 @pytest.mark.parametrize("agent", [OURS, TRUE, "PPO", IMAGINED, "random"])

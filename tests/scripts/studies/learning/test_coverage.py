@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from exact import exact_toy_text
+from exact import toy_text_mdp
 from exploration import main
 from mbagent.models import TabularModel
 from studies.learning.coverage import outcomes, reachable, wrongness
@@ -14,9 +14,9 @@ from worlds.environments import exact_world, find_world, true_model
 
 
 def test_reachable_states_are_those_in_which_play_goes_on() -> None:
-    cliff = exact_toy_text(find_world("CliffWalking").make())
+    cliff = toy_text_mdp(find_world("CliffWalking").make())
     np.testing.assert_array_equal(reachable(cliff), np.arange(37))  # neither the cliff nor the goal
-    taxi = exact_toy_text(find_world("Taxi").make())
+    taxi = toy_text_mdp(find_world("Taxi").make())
     assert len(reachable(taxi)) == 400
 
 
