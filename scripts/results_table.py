@@ -19,7 +19,7 @@ from rich.console import Console
 from mbagent import files
 from mbagent.evaluation.statistics import interquartile_mean
 from studies.comparison.records import AGENT, LEARNED_REWARD, TRUE_MODEL
-from studies.external.summary import markdown_table as external_table
+from studies.external import markdown_table as external_table
 from studies.pruning.page import markdown_table as pruning_table
 from studies.sampling_accuracy.results import load_scores
 from studies.sampling_accuracy.summary import markdown_table

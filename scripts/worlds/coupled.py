@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from harness import Row
 from mbagent.models.base import Actions, Bools, Floats, Randomness, States, Successors, as_keys
 from mbagent.models.known import KnownModel
 from mbagent.models.systematic import independent_successors
@@ -16,8 +16,6 @@ from mbagent.planning.goal import Goal
 from mbagent.planning.mcts import MctsPlanner
 from mbagent.planning.planner import PlannerSettings
 from mbagent_envs.random_keys import derive, uniforms
-
-Row = dict[str, Any]
 
 EPISODES, STEPS = 16, 40
 """Episodes played side by side, and their length."""

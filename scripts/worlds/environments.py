@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium.wrappers import DiscretizeObservation, TransformObservation
 
 from exact import FiniteHorizonMDP, toy_text_mdp
+from harness import find
 from mbagent.adapters.minatar import make_minatar
 from mbagent.adapters.minigrid import make_minigrid
 from mbagent.adapters.rddl import RddlEnv
@@ -118,11 +119,7 @@ def find_world(name: str) -> World:
     Raises:
         ValueError: there is none; the message lists those there are.
     """
-    known = (*WORLDS, *CONTINUOUS, *ARCADE)
-    for world in known:
-        if world.name == name:
-            return world
-    raise ValueError(f"There is no world {name!r}; choose from {', '.join(repr(world.name) for world in known)}.")
+    return find("world", name, {world.name: world for world in (*WORLDS, *CONTINUOUS, *ARCADE)})
 
 
 @cache

@@ -10,6 +10,7 @@ import gymnasium as gym
 
 import mbagent_envs  # noqa: F401  (registers the games)
 from exact import toy_text_mdp
+from harness import find
 from mbagent.evaluation.evaluate import Evaluation, Policy, evaluate_env, evaluate_game, random_policy
 from mbagent_envs.game import Game
 from mbagent_envs.references import reference_policy
@@ -138,10 +139,7 @@ def find_case(key: str) -> Case:
     Raises:
         ValueError: there is none; the message lists those there are.
     """
-    for case in CASES:
-        if case.key == key:
-            return case
-    raise ValueError(f"There is no case {key!r}; choose from {', '.join(case.key for case in CASES)}.")
+    return find("case", key, {case.key: case for case in CASES})
 
 
 def game_of(case: Case) -> Game | None:

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import copy
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from harness import Row
 from mbagent.models.factory import build_model
 from mbagent.models.trust import likeliest
 from mbagent.spaces import FactoredSpace
 from mbagent.transitions import TransitionBatch, TransitionDataset
 from mbagent.wrappers import History
-
-Row: TypeAlias = dict[str, Any]
 
 GAMES = {"breakout": 1, "freeway": 5, "asterix": 1}
 """Games and how many steps back a history shows."""

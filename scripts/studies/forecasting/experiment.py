@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -14,7 +12,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import mbagent
-from harness import write_csv
+from harness import Result, Row, check_at_least, check_known
 from mbagent.models.base import Actions, Keys, States
 from mbagent.models.factory import build_direct
 from mbagent.models.forecasts import DirectForecastModel, iterate, longest_string, random_strings
@@ -83,9 +81,7 @@ class Settings:
     def __post_init__(self) -> None:
         """Checks the ranges."""
         names = [case.name for case in CASES]
-        for name in self.cases:
-            if name not in names:
-                raise ValueError(f"There is no game {name!r}; choose from {', '.join(map(repr, names))}.")
+        check_known("game", self.cases, names)
         if not self.cases:
             raise ValueError(f"There is nothing to measure: name at least one game of {', '.join(map(repr, names))}.")
         for case in (case for case in CASES if case.name in self.cases):
@@ -97,16 +93,7 @@ class Settings:
                 )
         if not self.steps or min(self.steps) < 1:
             raise ValueError(f"Forecasts reach n = 1, 2, ... steps ahead, got {list(self.steps)}.")
-        for field, least in (
-            ("timesteps", 100),
-            ("seeds", 1),
-            ("n_starts", 1),
-            ("n_draws", 2),
-            ("episodes", 0),
-            ("first_seed", 0),
-        ):
-            if getattr(self, field) < least:
-                raise ValueError(f"{field} must be at least {least}, got {getattr(self, field)}.")
+        check_at_least(self, timesteps=100, seeds=1, n_starts=1, n_draws=2, episodes=0, first_seed=0)
 
 
 @dataclass(frozen=True)
@@ -132,17 +119,7 @@ class Score:
 
 
 @dataclass(frozen=True)
-class Return:
-    """Mean return of flat Monte Carlo with one kind of forecasts."""
-
-    case: str
-    seed: int
-    forecasts: str
-    value: float
-
-
-@dataclass(frozen=True)
-class Task:
+class Cell:
     """One game with one seed."""
 
     case: Case
@@ -150,38 +127,32 @@ class Task:
     settings: Settings
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What a task found."""
-
-    task: Task
-    scores: list[Score]
-    returns: list[Return]
-
-
-def plan(settings: Settings) -> list[Task]:
-    """All tasks, those on planes first, since they take longest."""
+def cells(settings: Settings) -> list[Cell]:
+    """All cells, those on planes first, since they take longest."""
     chosen = [case for case in reversed(CASES) if case.name in settings.cases]
-    return [Task(case, settings.first_seed + i, settings) for case in chosen for i in range(settings.seeds)]
+    return [Cell(case, settings.first_seed + i, settings) for case in chosen for i in range(settings.seeds)]
 
 
-def run_task(task: Task) -> Outcome:
-    """Learns, forecasts, compares."""
+def run_cell(cell: Cell) -> Result[Cell]:
+    """Learns, forecasts, compares. Tables: "results", see ``Score``; "returns", mean returns with either kind of forecasts."""
     torch.set_num_threads(1)
-    env, settings = task.case.make(), task.settings
+    env, settings = cell.case.make(), cell.settings
     space, n_actions = FactoredSpace(env.observation_space), ActionEnumeration(env.action_space).n
     longer = tuple(n for n in settings.steps if n > 1)
-    agent = mbagent.ModelLearningAgent("FlatMonteCarloPolicy", env, model="tabular", seed=task.seed)
+    agent = mbagent.ModelLearningAgent("FlatMonteCarloPolicy", env, model="tabular", seed=cell.seed)
     agent.learn(settings.timesteps)
     model = build_direct(space, n_actions, agent.learning_rate, longer)  # type: ignore[arg-type]  # a number here
-    log = model.fit(agent.transitions, seed=task.seed).log
+    log = model.fit(agent.transitions, seed=cell.seed).log
     seconds = {n: log.get(f"seconds_{n}_steps", NAN) for n in (1, *longer)}
-    scores = _compare(task, SimulatorModel(env.unwrapped.game), model, seconds)  # type: ignore[attr-defined]
-    return Outcome(task, scores, _play(task, model) if settings.episodes else [])
+    scores = _compare(cell, SimulatorModel(env.unwrapped.game), model, seconds)  # type: ignore[attr-defined]
+    played = _play(cell, model) if settings.episodes else []
+    return Result(
+        cell, {"results": [asdict(score) for score in scores], "returns": played}, f"{cell.case.name}, seed {cell.seed}"
+    )
 
 
-def _compare(task: Task, true: SimulatorModel, model: DirectForecastModel, seconds: dict[int, float]) -> list[Score]:
-    settings, seed = task.settings, task.seed
+def _compare(cell: Cell, true: SimulatorModel, model: DirectForecastModel, seconds: dict[int, float]) -> list[Score]:
+    settings, seed = cell.settings, cell.seed
     starts = _typical(true, settings.n_starts, seed)
     strings = random_strings(derive(seed, 3, np.arange(len(starts))), max(settings.steps), true.n_actions)
     listed = m.listed_states(true, starts, MOST_LISTED)
@@ -204,7 +175,7 @@ def _compare(task: Task, true: SimulatorModel, model: DirectForecastModel, secon
             joint = joints.get((method, n), NAN)
             inexact, marginal = m.inexact_share(draws, truth), m.marginal_variation(draws, truth, true.cardinalities)
             took = {"iterated": seconds[1], "direct": seconds.get(n, NAN)}.get(method, NAN)
-            scores.append(Score(task.case.name, seed, method, n, joint, inexact, marginal, took))
+            scores.append(Score(cell.case.name, seed, method, n, joint, inexact, marginal, took))
     return scores
 
 
@@ -242,25 +213,20 @@ def _joints(
     return result
 
 
-def _play(task: Task, model: DirectForecastModel) -> list[Return]:
+def _play(cell: Cell, model: DirectForecastModel) -> list[Row]:
     """Flat Monte Carlo with either kind of forecasts, on episodes of the same seeds."""
-    settings, returns = task.settings, []
+    settings, rows = cell.settings, []
     for forecasts in ("iterated", "direct"):
-        env = make_vec_env(task.case.make, n_envs=settings.episodes, seed=task.seed)
+        env = make_vec_env(cell.case.make, n_envs=settings.episodes, seed=cell.seed)
         agent = mbagent.ModelLearningAgent(
             "FlatMonteCarloPolicy",
             env,
             model=model,
             horizon=max(settings.steps),
             policy_kwargs={"forecasts": forecasts},
-            seed=task.seed,
+            seed=cell.seed,
         )
         agent.set_parameters(agent.get_parameters())  # the model is fitted: no learning is needed
         value, _ = evaluate_policy(agent, env, n_eval_episodes=settings.episodes)
-        returns.append(Return(task.case.name, task.seed, forecasts, float(value)))  # type: ignore[arg-type]
-    return returns
-
-
-def save_csv(path: Path, rows: Sequence[Score] | Sequence[Return], kind: type[Score] | type[Return]) -> None:
-    """Writes a csv with a line for each."""
-    write_csv(path, [asdict(row) for row in rows], [field.name for field in fields(kind)])
+        rows.append({"case": cell.case.name, "seed": cell.seed, "forecasts": forecasts, "value": float(value)})  # type: ignore[arg-type]
+    return rows

@@ -11,11 +11,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from harness import Row, Tables
 from mbagent import files
 from mbagent.evaluation.report import FIGURE_STYLE, render, to_png
 from mbagent.evaluation.statistics import Interval, mean_interval
 from studies import TEMPLATES
-from studies.forecasting.experiment import CASES, Method, Outcome, Return, Score, Settings
+from studies.forecasting.experiment import CASES, Method, Settings
 
 MEASURES: dict[str, str] = {
     "joint": "total variation of the joint distribution",
@@ -32,7 +33,7 @@ _LOOKS: dict[Method, tuple[str, str, str]] = {
 
 
 @dataclass(frozen=True)
-class Row:
+class Line:
     """Errors at n steps, by method: the case's measure, and single variables; and the direct model's fit, in seconds."""
 
     n: int
@@ -47,38 +48,40 @@ class Table:
 
     name: str
     measure: str
-    rows: list[Row]
+    lines: list[Line]
     seeds: int
     returns: dict[str, Interval]
 
 
-def tables(scores: Sequence[Score], returns: Sequence[Return]) -> list[Table]:
+def tables(scores: Sequence[Row], returns: Sequence[Row]) -> list[Table]:
     """A table for each game that was measured."""
     found = []
     for case in CASES:
-        mine = [score for score in scores if score.case == case.name]
+        mine = [score for score in scores if score["case"] == case.name]
         if not mine:
             continue
-        measure = next(name for name in MEASURES if all(np.isfinite(getattr(score, name)) for score in mine))
-        rows = [_row([score for score in mine if score.n == n], n, measure) for n in sorted({score.n for score in mine})]
-        played = [r for r in returns if r.case == case.name]
-        means = {kind: mean_interval(r.value for r in played if r.forecasts == kind) for kind in ("iterated", "direct")}
-        found.append(Table(case.name, measure, rows, len({score.seed for score in mine}), means if played else {}))
+        measure = next(name for name in MEASURES if all(np.isfinite(score[name]) for score in mine))
+        lines = [_line([score for score in mine if score["n"] == n], n, measure) for n in sorted({score["n"] for score in mine})]
+        played = [row for row in returns if row["case"] == case.name]
+        means = {
+            kind: mean_interval(row["value"] for row in played if row["forecasts"] == kind) for kind in ("iterated", "direct")
+        }
+        found.append(Table(case.name, measure, lines, len({score["seed"] for score in mine}), means if played else {}))
     return found
 
 
-def _row(scores: Sequence[Score], n: int, measure: str) -> Row:
+def _line(scores: Sequence[Row], n: int, measure: str) -> Line:
     def mean(method: Method, field: str) -> Interval:
-        return mean_interval(getattr(score, field) for score in scores if score.method == method)
+        return mean_interval(score[field] for score in scores if score["method"] == method)
 
     errors = {method: mean(method, measure) for method in _LOOKS}
     marginals = {method: mean(method, "marginal") for method in _LOOKS}
-    return Row(n, errors, marginals, mean("direct", "fit_seconds").estimate)
+    return Line(n, errors, marginals, mean("direct", "fit_seconds").estimate)
 
 
-def write_page(path: Path, outcomes: Sequence[Outcome], settings: Settings, command: str) -> bytes:
+def write_page(path: Path, results: Tables, settings: Settings, command: str) -> bytes:
     """Writes the HTML page, picture and all, into one file; returns the picture as PNG."""
-    found = tables([s for o in outcomes for s in o.scores], [r for o in outcomes for r in o.returns])
+    found = tables(results["results"], results.get("returns", []))
     figure = draw_errors(found)
     page = render(
         TEMPLATES / "forecasts.html.jinja", tables=found, measures=MEASURES, figure=figure, settings=settings, command=command
@@ -108,11 +111,11 @@ def draw_errors(found: Sequence[Table]) -> bytes:
 
 
 def _draw_panel(axes: Axes, table: Table) -> None:
-    steps = [row.n for row in table.rows]
+    steps = [line.n for line in table.lines]
     for method, (label, colour, marker) in _LOOKS.items():
         if method == "true again" and table.measure != "marginal":
             continue  # zero by definition
-        cells = [row.errors[method] for row in table.rows]
+        cells = [line.errors[method] for line in table.lines]
         axes.plot(steps, [c.estimate for c in cells], color=colour, marker=marker or None, markersize=4, label=label)
         low, high = [max(c.low, 0.0) for c in cells], [min(c.high, 1.0) for c in cells]  # every measure is a share
         axes.fill_between(steps, low, high, color=colour, alpha=0.15, linewidth=0)

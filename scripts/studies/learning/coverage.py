@@ -6,7 +6,6 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -14,14 +13,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from exact import FiniteHorizonMDP
+from harness import Result, Row, Run, grouped
 from mbagent.agent import ModelLearningAgent
 from mbagent.evaluation.report import FIGURE_STYLE, to_png
 from mbagent.models.base import Actions, States, Successors, TransitionModel
 from mbagent.spaces import FactoredSpace
 from worlds.distractors import BesideWorld
 from worlds.environments import World, exact_world, true_model
-
-Row = dict[str, Any]
 
 MAX_PAIRS = 400
 """Model error is measured on so many reachable (state, action), drawn once."""
@@ -31,7 +29,7 @@ MAX_OUTCOMES = 1 << 14
 
 
 @dataclass(frozen=True)
-class Study:
+class Cell:
     """One exploration in one world with one seed.
 
     Attributes:
@@ -83,23 +81,24 @@ def wrongness(model: TransitionModel, truth: Successors, states: States, actions
     return float(1.0 - shared.mean())
 
 
-def run_study(study: Study) -> list[Row]:
+def run_cell(cell: Cell) -> Result[Cell]:
     """Explores and fits from mark to mark; a row for each. There is no return where a world has no reward.
 
     Raises:
         ValueError: the world's rules are not known.
     """
-    agent = ModelLearningAgent("MctsPolicy", study.world.make(), seed=study.seed, exploration=study.exploration)
-    figures = _beside(study.world, agent) if isinstance(study.world, BesideWorld) else _exactly(study.world, agent)
+    agent = ModelLearningAgent("MctsPolicy", cell.world.make(), seed=cell.seed, exploration=cell.exploration)
+    figures = _beside(cell.world, agent) if isinstance(cell.world, BesideWorld) else _exactly(cell.world, agent)
     rows: list[Row] = []
-    for mark in study.marks:
+    for mark in cell.marks:
         began = time.process_time()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that the reward is learned, or there is none
             agent.learn(mark - agent.num_timesteps, log_interval=None, reset_num_timesteps=False)
-        row = {"world": study.world.name, "exploration": study.exploration, "seed": study.seed, "steps": mark}
+        row = {"world": cell.world.name, "exploration": cell.exploration, "seed": cell.seed, "steps": mark}
         rows.append(row | figures() | {"learn_seconds": time.process_time() - began})
-    return rows
+    label = f"{cell.world.name}, {cell.exploration}, seed {cell.seed}: {100 * rows[-1]['tried']:.1f}% tried"
+    return Result(cell, {"coverage": rows}, label)
 
 
 def _exactly(world: World, agent: ModelLearningAgent) -> Callable[[], Row]:
@@ -142,6 +141,15 @@ def _beside(world: BesideWorld, agent: ModelLearningAgent) -> Callable[[], Row]:
 def _pairs(numbers: NDArray[np.int64], n_actions: int) -> NDArray[np.int64]:
     """Every (state, action), int64 [N, 2]."""
     return np.stack([part.ravel() for part in np.meshgrid(numbers, np.arange(n_actions), indexing="ij")], axis=1)
+
+
+def show(rows: Sequence[Row], run: Run) -> None:
+    """Prints means over seeds."""
+    lines = []
+    for (world, steps, exploration), own in sorted(grouped(rows, ("world", "steps", "exploration")).items()):
+        tried, error, value = (float(np.mean([row[name] for row in own])) for name in ("tried", "error", "normalised"))
+        lines.append([world, exploration, f"{steps:,}", f"{100 * tried:.1f}%", f"{error:.4f}", f"{value:.3f}"])
+    run.show("Exploration", ("world", "exploration", "steps", "tried", "model error", "normalised return"), lines)
 
 
 def draw_coverage(rows: Sequence[Row]) -> bytes:

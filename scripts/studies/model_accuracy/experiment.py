@@ -5,12 +5,13 @@ from __future__ import annotations
 import importlib.util
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
 from gymnasium.spaces import MultiBinary
 
+from harness import Result, Row, check_at_least, check_known, grouped
 from mbagent.models.base import Bools, Floats, States, TransitionModel
 from mbagent.models.factory import build_model
 from mbagent.models.simulator import SimulatorModel
@@ -89,9 +90,7 @@ class Settings:
     def __post_init__(self) -> None:
         """Checks the ranges."""
         names = [case.name for case in CASES]
-        for name in self.cases:
-            if name not in names:
-                raise ValueError(f"There is no case {name!r}; choose from {', '.join(map(repr, names))}.")
+        check_known("case", self.cases, names)
         if not self.models:
             raise ValueError("There is nothing to measure: name at least one model.")
         if "bayesnet" in self.models:
@@ -102,9 +101,7 @@ class Settings:
             build_model(name, FactoredSpace(MultiBinary(1)), 1, LEARNING_RATE)  # an unknown name is told before all work
         if not self.steps or min(self.steps) < EPISODE:
             raise ValueError(f"Steps to learn from must be {EPISODE} or more, got {list(self.steps)}.")
-        for field, least in (("seeds", 1), ("first_seed", 0), ("n_tests", EPISODE)):
-            if getattr(self, field) < least:
-                raise ValueError(f"{field} must be at least {least}, got {getattr(self, field)}.")
+        check_at_least(self, seeds=1, first_seed=0, n_tests=EPISODE)
 
 
 @dataclass(frozen=True)
@@ -136,7 +133,7 @@ class Score:
 
 
 @dataclass(frozen=True)
-class Task:
+class Cell:
     """One world with one seed and one number of steps, for all models."""
 
     case: Case
@@ -145,24 +142,16 @@ class Task:
     settings: Settings
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What a task found."""
-
-    task: Task
-    scores: list[Score]
-
-
-def plan(settings: Settings) -> list[Task]:
-    """All tasks, the largest first."""
+def cells(settings: Settings) -> list[Cell]:
+    """All cells, the largest first."""
     chosen = [case for case in CASES if case.name in settings.cases]
-    tasks = [
-        Task(case, settings.first_seed + i, steps, settings)
+    found = [
+        Cell(case, settings.first_seed + i, steps, settings)
         for steps in dict.fromkeys(settings.steps)
         for case in chosen
         for i in range(settings.seeds)
     ]
-    return sorted(tasks, key=lambda task: (task.case.flat, -task.steps))
+    return sorted(found, key=lambda cell: (cell.case.flat, -cell.steps))
 
 
 def random_play(game: Game, n_steps: int, seed: int, order: States) -> TransitionBatch:
@@ -182,28 +171,29 @@ def random_play(game: Game, n_steps: int, seed: int, order: States) -> Transitio
     return rows.select(np.arange(n_steps))
 
 
-def run_task(task: Task) -> Outcome:
-    """Learns and measures."""
-    if "bayesnet" in task.settings.models:
+def run_cell(cell: Cell) -> Result[Cell]:
+    """Learns and measures; the rows are those of ``Score``."""
+    if "bayesnet" in cell.settings.models:
         bayesnet.register()
     torch.set_num_threads(1)
-    game, seed = task.case.game(), task.seed
+    game, seed = cell.case.game(), cell.seed
     true, space = SimulatorModel(game), FactoredSpace(game.observation_space)
     order = np.arange(len(space))
-    if task.case.flat:
+    if cell.case.flat:
         order, space = np.random.default_rng(seed).permutation(len(space)), FactoredSpace(MultiBinary(len(space)))
     data = TransitionDataset(space.cardinalities, true.n_actions)
-    data.append(random_play(game, task.steps, seed, order))
-    tests = random_play(game, task.settings.n_tests, seed + 10_000, order)
+    data.append(random_play(game, cell.steps, seed, order))
+    tests = random_play(game, cell.settings.n_tests, seed + 10_000, order)
     certain = certain_factors(true, tests, order, seed)
     scores = []
-    for name in task.settings.models:
+    for name in cell.settings.models:
         model = build_model(name, space, true.n_actions, LEARNING_RATE)
         began = time.process_time()
         model.fit(data, seed=seed)
         seconds = time.process_time() - began
-        scores.append(replace(_score(model, true, tests, certain, order), fit_seconds=seconds, case=task.case.name, model=name))
-    return Outcome(task, [replace(score, seed=seed, steps=task.steps) for score in scores])
+        scores.append(replace(_score(model, true, tests, certain, order), fit_seconds=seconds, case=cell.case.name, model=name))
+    rows = [asdict(replace(score, seed=seed, steps=cell.steps)) for score in scores]
+    return Result(cell, {"results": rows}, f"{cell.case.name}, {cell.steps} steps, seed {cell.seed}")
 
 
 def certain_factors(true: SimulatorModel, rows: TransitionBatch, order: States, seed: int) -> Bools:
@@ -265,11 +255,10 @@ def joint_variation(
     return float((0.5 * (apart + missing)).mean())
 
 
-def means(scores: Sequence[Score]) -> dict[tuple[str, str, int], dict[str, float]]:
+def means(scores: Sequence[Row]) -> dict[tuple[str, str, int], dict[str, float]]:
     """Mean over seeds of each figure, by (case, model, steps)."""
-    found: dict[tuple[str, str, int], dict[str, float]] = {}
     figures = ("likeliest", "sampled", "joint", "log_likelihood", "fit_seconds", "sample_microseconds")
-    for key in dict.fromkeys((s.case, s.model, s.steps) for s in scores):
-        group = [s for s in scores if (s.case, s.model, s.steps) == key]
-        found[key] = {name: float(np.mean([getattr(s, name) for s in group])) for name in figures}
-    return found
+    return {
+        (case, model, steps): {name: float(np.mean([row[name] for row in group])) for name in figures}
+        for (case, model, steps), group in grouped(scores, ("case", "model", "steps")).items()
+    }

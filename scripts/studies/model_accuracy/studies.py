@@ -5,14 +5,17 @@ Each study is a function of (seed, full) that returns rows: plain dictionaries w
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
 
 import gymnasium as gym
 import numpy as np
+import torch
 from gymnasium.spaces import MultiBinary
 from numpy.typing import NDArray
 from scipy.stats import rankdata, spearmanr
@@ -20,6 +23,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
+from harness import Result, Row, check_known
 from mbagent.agent import ModelLearningAgent
 from mbagent.models.base import Bools, Floats, TransitionModel
 from mbagent.models.factory import build_model
@@ -37,7 +41,6 @@ from worlds.minatar import minatar, variants
 from worlds.nonstationary import CHANGES
 
 Ints: TypeAlias = NDArray[np.int64]
-Row: TypeAlias = dict[str, Any]
 NAN = float("nan")
 N_TESTS = 20_000
 
@@ -267,6 +270,35 @@ STUDIES: dict[str, Study] = {
     "agents": agents,
     "minatar": minatar,
 }
+
+
+@dataclass(frozen=True)
+class Question:
+    """One study, or a part of it, with one seed."""
+
+    study: str
+    work: Study
+    seed: int
+    full: bool
+
+
+def questions(names: Sequence[str], seeds: Sequence[int], full: bool) -> list[Question]:
+    """All parts of some studies with all seeds.
+
+    Raises:
+        ValueError: a study is unknown, or its packages are missing.
+    """
+    check_known("study", names, STUDIES)
+    if "minatar" in names and importlib.util.find_spec("minatar") is None:
+        raise ValueError('The study minatar needs MinAtar: pip install "mbagent[minatar]".')
+    return [Question(name, work, seed, full) for name in names for seed in seeds for work in parts(name, full)]
+
+
+def answer(question: Question) -> Result[Question]:
+    """Runs a study."""
+    torch.set_num_threads(1)
+    rows = question.work(question.seed, question.full)
+    return Result(question, {question.study: rows}, f"{question.study}, seed {question.seed}")
 
 
 def parts(study: str, full: bool) -> list[Study]:

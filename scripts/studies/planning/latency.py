@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 from stable_baselines3 import PPO
 
+from harness import Row
 from mbagent.agent import ModelLearningAgent
 from mbagent.evaluation.baselines import as_policy
 from mbagent.evaluation.statistics import interquartile_mean, normalised
 from worlds.games import Scale, find_case, game_of, play
-
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from exact import toy_text_mdp
+from harness import Row
 from mbagent.agent import ModelLearningAgent
 from mbagent.evaluation.baselines import as_policy
 from mbagent.evaluation.statistics import interquartile_interval, normalised
@@ -17,8 +18,6 @@ from mbagent.models.base import Floats
 from mbagent.models.simulator import SimulatorModel
 from mbagent.models.table import toy_text_model
 from worlds.games import Scale, find_case, game_of, measure_scale, play
-
-Row = dict[str, Any]
 
 GAMES = ("geyser_deterministic", "geyser_low_cost", "geyser_high_cost", "flier_catcher", "maneuverer")
 """Cases that are games."""

@@ -8,14 +8,12 @@ import subprocess
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
+from harness import Row
 from mbagent.agent import ModelLearningAgent
 from worlds.games import find_case
-
-Row = dict[str, Any]
 
 SCRIPTS = Path(__file__).parents[2]
 """Where the modules of the studies are found."""

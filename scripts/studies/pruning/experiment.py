@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Literal, TypeAlias
 
 import numpy as np
 
 import mbagent
+from harness import Result, check_at_least
 from mbagent.models.arithmetic import Floats
 from mbagent.models.config import NeuralConfig
 from mbagent.models.modules import Influence, dependent_groups, influence, modules
@@ -67,9 +68,7 @@ class Settings:
             raise ValueError(f"Shares of connections to remove are numbers from 0 up to but not 1, got {list(self.fractions)}.")
         if not self.ways:
             raise ValueError("Name at least one way to prune: 'by size' or 'by evidence'.")
-        for name, least in (("timesteps", 100), ("seeds", 1), ("episodes", 0), ("first_seed", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}.")
+        check_at_least(self, timesteps=100, seeds=1, episodes=0, first_seed=0)
 
 
 @dataclass(frozen=True)
@@ -116,7 +115,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Task:
+class Cell:
     """One game with one seed."""
 
     game: str
@@ -126,10 +125,10 @@ class Task:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a task found.
+    """What a cell found.
 
     Attributes:
-        task: which.
+        cell: which.
         names: of the state variables.
         actions: names of the actions.
         rows: one for each share and way.
@@ -140,7 +139,7 @@ class Outcome:
         others: microseconds of a next state by other networks, see ``measures.measure_others``.
     """
 
-    task: Task
+    cell: Cell
     names: tuple[str, ...]
     actions: tuple[str, ...]
     rows: list[Row] = field(default_factory=list)
@@ -152,55 +151,56 @@ class Outcome:
     others: dict[str, float] = field(default_factory=dict)
 
 
-def plan(settings: Settings) -> list[Task]:
-    """All tasks."""
+def cells(settings: Settings) -> list[Cell]:
+    """All cells."""
     seeds = range(settings.first_seed, settings.first_seed + settings.seeds)
-    return [Task(game, seed, settings) for seed in seeds for game in settings.games]
+    return [Cell(game, seed, settings) for seed in seeds for game in settings.games]
 
 
-def run_task(task: Task) -> Outcome:
-    """Learns once, and prunes the same learned agent to each share in each way."""
-    case = find_case(task.game)
-    env, settings = case.make_env(), task.settings
+def run_cell(cell: Cell) -> Result[Cell]:
+    """Learns once, and prunes the same learned agent to each share in each way; ``arrays["outcome"]`` is the ``Outcome``."""
+    case = find_case(cell.game)
+    env, settings = case.make_env(), cell.settings
     space, n_actions = FactoredSpace(env.observation_space), ActionEnumeration(env.action_space).n
     config = NeuralConfig() if settings.networks == "causal" else NeuralConfig.paper(len(space))
     model = NeuralTransitionModel(space.cardinalities, n_actions, config)
-    agent = mbagent.ModelLearningAgent("MctsPolicy", env, model=model, seed=task.seed)
+    agent = mbagent.ModelLearningAgent("MctsPolicy", env, model=model, seed=cell.seed)
     agent.learn(settings.timesteps, log_interval=None)
     learned, scale = agent.get_parameters(), measure_scale(case) if settings.episodes else Scale(0.0, 1.0)
     game = game_of(case)
     assert game is not None
-    outcome = Outcome(task, tuple(space.names), game.action_names)
-    outcome.others.update(measure_others(model, *unseen_play(case, task.seed)[:2], task.seed))
+    outcome = Outcome(cell, tuple(space.names), game.action_names)
+    outcome.others.update(measure_others(model, *unseen_play(case, cell.seed)[:2], cell.seed))
     for fraction in settings.fractions:
         for way in settings.ways if fraction > 0.0 else settings.ways[:1]:
             agent.set_parameters(learned)
             if fraction > 0.0:
                 agent.prune(fraction, config=PruningConfig(evidence=way == "by evidence"))
             _measure((fraction, way), case, scale, agent, model, outcome)
-    return outcome
+    rows = [asdict(row) for row in outcome.rows]
+    return Result(cell, {"results": rows}, f"{cell.game}, seed {cell.seed}", {"outcome": outcome})
 
 
 def _measure(
     key: Key, case: Case, scale: Scale, agent: mbagent.ModelLearningAgent, model: NeuralTransitionModel, outcome: Outcome
 ) -> None:
     """Everything about one pruned agent, added to the outcome."""
-    task, report, found, game = outcome.task, agent.fit_report, influence(model, effective=True), game_of(case)
+    cell, report, found, game = outcome.cell, agent.fit_report, influence(model, effective=True), game_of(case)
     assert game is not None
-    outcome.returns[key] = _play(task, case, scale, agent)
-    states, actions, following = unseen_play(case, task.seed)
+    outcome.returns[key] = _play(cell, case, scale, agent)
+    states, actions, following = unseen_play(case, cell.seed)
     connections = model.connections().values()
     left, possible = sum(part.left for part in connections), sum(part.total for part in connections)
     row = Row(
-        task.game,
-        task.seed,
+        cell.game,
+        cell.seed,
         *key,
         left,
         1.0 - left / possible,
         float(outcome.returns[key].mean()) if len(outcome.returns[key]) else float("nan"),
         excess(case, model, states, actions, following),
         marginal_error(case, model, states[:300], actions[:300]),
-        *measure_speeds(model, np.tile(states, (10, 1)), np.tile(actions, 10), task.seed),
+        *measure_speeds(model, np.tile(states, (10, 1)), np.tile(actions, 10), cell.seed),
         *agreement(game, found),
         report.seconds if report is not None else float("nan"),
     )
@@ -210,12 +210,12 @@ def _measure(
     outcome.groups[key] = [module.text(outcome.names) for module in dependent_groups(found)]
 
 
-def _play(task: Task, case: Case, scale: Scale, agent: mbagent.ModelLearningAgent) -> Floats:
+def _play(cell: Cell, case: Case, scale: Scale, agent: mbagent.ModelLearningAgent) -> Floats:
     """Normalised returns of the episodes, the same ones whatever the agent."""
-    episodes = task.settings.episodes
+    episodes = cell.settings.episodes
     if not episodes:
         return np.zeros(0)
     policy = lambda obs: agent.predict(obs, deterministic=True)[0]  # noqa: E731
-    returns = play(case, policy, episodes=episodes, seed=task.seed, repeatable=True).default
+    returns = play(case, policy, episodes=episodes, seed=cell.seed, repeatable=True).default
     normal: Floats = (returns - scale.random) / (scale.reference - scale.random)
     return normal

@@ -102,8 +102,8 @@ def summary(outcomes: Sequence[Outcome]) -> list[tuple[Key, Cells]]:
 def summary_rows(outcomes: Sequence[Outcome]) -> list[dict[str, str | int | float]]:
     """The summary of each game as rows for a file."""
     rows: list[dict[str, str | int | float]] = []
-    for game in dict.fromkeys(outcome.task.game for outcome in outcomes):
-        mine = [outcome for outcome in outcomes if outcome.task.game == game]
+    for game in dict.fromkeys(outcome.cell.game for outcome in outcomes):
+        mine = [outcome for outcome in outcomes if outcome.cell.game == game]
         for (fraction, way), cells in summary(mine):
             rows.append({"game": game, "seeds": len(mine), "fraction": fraction, "way": way, **cells})
     return rows
@@ -133,7 +133,7 @@ def write_page(
     sections: list[Section] = []
     pictures: dict[str, bytes] = {}
     for game in settings.games:
-        mine = sorted((o for o in outcomes if o.task.game == game), key=lambda o: o.task.seed)
+        mine = sorted((o for o in outcomes if o.cell.game == game), key=lambda o: o.cell.seed)
         if mine:
             sections.append(section_of(mine))
             pictures |= {f"{game}_{name}": png for name, (_, png) in sections[-1].pictures.items()}
@@ -163,11 +163,11 @@ def section_of(outcomes: Sequence[Outcome]) -> Section:
     pictures: dict[str, tuple[str, bytes]] = {"curves": ("What is left against the pruned fraction", draw_curves(rows))}
     for number, key in enumerate(dict.fromkeys((whole, middle, shown))):
         pictures[f"paths_{number}"] = (captioned(key), draw_paths(first, key, linked(first, shown)))
-    if (game := game_of(find_case(first.task.game))) is not None:
+    if (game := game_of(find_case(first.cell.game))) is not None:
         picture = draw_modules(first.linked[shown], game.observation_space.shape)
         pictures["modules"] = (f"Modules, {captioned(shown)}", picture)
     others = {name: float(np.mean([o.others[name] for o in outcomes])) for name in first.others}
-    title = find_case(first.task.game).title
+    title = find_case(first.cell.game).title
     ratios = {name: (cost, cost / best["used"]) for name, cost in others.items()}
     return Section(title, len(outcomes), rows, ratios, pictures, first.modules[shown], first.groups[shown], shown)
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from harness import Result, check_known
 from studies.sampling_accuracy import samplers as s
 from studies.sampling_accuracy.data import DataOptions, generate
-from studies.sampling_accuracy.scores import FEW_DRAWS, Bench, Score, timed
+from studies.sampling_accuracy.scores import FEW_DRAWS, Bench, timed
 from studies.sampling_accuracy.trials import SCALING, TRIALS, Trial, find_trial
 from studies.sampling_accuracy.variants import VARIANTS, fit_masked
 
@@ -29,6 +27,9 @@ MOST_DRAWS = 1_000_000
 
 Part = Literal["samplers", "variants", "scaling"]
 """Every sampler in every trial; the combined sampler with one thing changed at a time; growing numbers of variables."""
+
+TABLES: dict[Part, str] = {"samplers": "results", "variants": "variants", "scaling": "scaling"}
+"""What the table of each part is called."""
 
 VARIED = {"2a": 5, "2c": 5, "3": 1}
 """Trials in which one thing at a time is changed, and on how many data sets: those where the paper reports more than
@@ -64,17 +65,14 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
-        names = [trial.name for trial in TRIALS]
-        for name in self.trials:
-            if name not in names:
-                raise ValueError(f"There is no trial {name!r}; choose from {', '.join(names)}.")
+        check_known("trial", self.trials, [trial.name for trial in TRIALS])
         if self.seeds is not None and self.seeds < 1:
             raise ValueError(f"seeds must be at least 1 data set, got {self.seeds}.")
         if self.first_seed < 0:
             raise ValueError(f"first_seed must be 0 or more, got {self.first_seed}.")
         if not 1 <= self.n_draws <= MOST_DRAWS:
             raise ValueError(f"n_draws must lie between 1 and {MOST_DRAWS:,}, got {self.n_draws:,}.")
-        if not plan(self):
+        if not cells(self):
             raise ValueError(
                 "There is nothing to measure: name at least one trial and one part "
                 f"(variants are measured in {', '.join(VARIED)})."
@@ -87,7 +85,7 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Task:
+class Cell:
     """One part of one trial with one seed."""
 
     trial: str
@@ -103,43 +101,43 @@ class Task:
         b = options.multiplier if self.part == "scaling" else given.multiplier
         return replace(options, relates=given.relates, shuffle=given.shuffle, multiplier=b)
 
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a task found; ``points`` holds pairs (observed, inferred) [M, 2] for the scatter plots, by sampler."""
-
-    task: Task
-    scores: list[Score]
-    points: dict[str, NDArray[np.float64]]
+    @property
+    def place(self) -> tuple[int, int]:
+        """What the rows of a table are sorted by: trial and seed."""
+        return [trial.name for trial in (*TRIALS, *SCALING)].index(self.trial), self.seed
 
 
-def plan(settings: Settings) -> list[Task]:
-    """All tasks, the longest first."""
-    tasks: list[Task] = []
+def cells(settings: Settings) -> list[Cell]:
+    """All cells, the longest first."""
+    found: list[Cell] = []
     chosen = [find_trial(name) for name in dict.fromkeys(settings.trials)]
     for part in dict.fromkeys(settings.parts):
         for trial in SCALING if part == "scaling" else chosen:
             n = min(_seeds(part, trial), settings.seeds or 10**9)
-            tasks += [Task(trial.name, settings.first_seed + i, settings, part) for i in range(n)]
-    return sorted(tasks, key=lambda task: (-task.options.d, -task.options.n_inputs))
+            found += [Cell(trial.name, settings.first_seed + i, settings, part) for i in range(n)]
+    return sorted(found, key=lambda cell: (-cell.options.d, -cell.options.n_inputs))
 
 
 def _seeds(part: Part, trial: Trial) -> int:
     return VARIED.get(trial.name, 0) if part == "variants" else trial.seeds
 
 
-def run_task(task: Task) -> Outcome:
-    """Fits and measures samplers on one data set."""
+def run_cell(cell: Cell) -> Result[Cell]:
+    """Fits and measures samplers on one data set.
+
+    The rows are those of ``Score``; ``arrays`` holds pairs (observed, inferred) [M, 2] for the scatter plots, by sampler.
+    """
     torch.set_num_threads(1)
-    n_draws = task.settings.n_draws
-    if task.part != "samplers" and task.options.d > s.EXHAUSTIVE:
+    n_draws = cell.settings.n_draws
+    if cell.part != "samplers" and cell.options.d > s.EXHAUSTIVE:
         n_draws = min(n_draws, FEW_DRAWS)
-    bench = Bench(task.trial, task.seed, generate(task.options, task.seed), n_draws)
-    if task.part == "samplers":
-        _samplers(bench, task.settings.fit, slow_ones=task.seed < task.settings.first_seed + SLOW_SEEDS)
+    bench = Bench(cell.trial, cell.seed, generate(cell.options, cell.seed), n_draws)
+    if cell.part == "samplers":
+        _samplers(bench, cell.settings.fit, slow_ones=cell.seed < cell.settings.first_seed + SLOW_SEEDS)
     else:
-        {"variants": _variants, "scaling": _scaling}[task.part](bench, task.settings.fit)
-    return Outcome(task, bench.scores, bench.points)
+        {"variants": _variants, "scaling": _scaling}[cell.part](bench, cell.settings.fit)
+    rows = [asdict(score) for score in bench.scores]
+    return Result(cell, {TABLES[cell.part]: rows}, f"{cell.part}, {cell.trial}, data set {cell.seed}", bench.points)
 
 
 def _samplers(bench: Bench, fit: s.FitOptions, slow_ones: bool) -> None:
@@ -176,10 +174,3 @@ def _scaling(bench: Bench, fit: s.FitOptions) -> None:
     masked, seconds = timed(lambda: fit_masked(bench.data, fit, bench.seed))
     bench.exact(s.CAUSAL, masked, seconds)
     bench.many(s.CAUSAL, masked, seconds)
-
-
-def collect(outcomes: Sequence[Outcome], part: Part = "samplers") -> list[Score]:
-    """All scores of a part, in the order of trials and seeds."""
-    order = {trial.name: i for i, trial in enumerate((*TRIALS, *SCALING))}
-    found = sorted((o for o in outcomes if o.task.part == part), key=lambda o: (order[o.task.trial], o.task.seed))
-    return [score for outcome in found for score in outcome.scores]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeAlias, get_type_hints
 from zipfile import BadZipFile
@@ -13,9 +13,9 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import write_csv
+from harness import Result
 from mbagent import files
-from studies.sampling_accuracy.experiment import Outcome, Settings
+from studies.sampling_accuracy.experiment import Cell, Settings
 from studies.sampling_accuracy.samplers import FitOptions
 from studies.sampling_accuracy.scores import Score
 from studies.sampling_accuracy.trials import find_trial
@@ -26,12 +26,12 @@ Points: TypeAlias = dict[tuple[str, str], NDArray[np.float64]]
 MOST_POINTS = 4000
 
 
-def first_points(outcomes: Sequence[Outcome]) -> Points:
+def first_points(results: Sequence[Result[Cell]]) -> Points:
     """The points of each trial's first data set, thinned out where they are too many to draw."""
     points: Points = {}
-    for outcome in sorted(outcomes, key=lambda o: o.task.seed, reverse=True):
-        for sampler, pairs in outcome.points.items():
-            points[outcome.task.trial, sampler] = pairs[:: max(1, len(pairs) // MOST_POINTS)]
+    for result in sorted(results, key=lambda result: result.cell.seed, reverse=True):
+        for sampler, pairs in result.arrays.items():
+            points[result.cell.trial, sampler] = pairs[:: max(1, len(pairs) // MOST_POINTS)]
     return points
 
 
@@ -57,13 +57,8 @@ def load_points(path: Path) -> Points:
     return {(name.partition("|")[0], name.partition("|")[2]): value for name, value in pairs.items()}
 
 
-def save_scores(path: Path, scores: Sequence[Score]) -> None:
-    """Writes a csv with a line for each sampler and data set."""
-    write_csv(path, [asdict(score) for score in scores], [field.name for field in fields(Score)])
-
-
 def load_scores(path: Path) -> list[Score]:
-    """Reads what ``save_scores`` wrote; nothing where there is no such file.
+    """Reads a table of scores; nothing where there is no such file.
 
     Raises:
         ValueError: the file is damaged; the message names the line.

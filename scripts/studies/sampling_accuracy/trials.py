@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from harness import check_known
 from studies.sampling_accuracy.data import DataOptions
 
 NAN = float("nan")
@@ -58,7 +59,7 @@ def find_trial(name: str) -> Trial:
     Raises:
         ValueError: there is none; the message lists those there are.
     """
-    for trial in (*TRIALS, *SCALING):
-        if trial.name == name:
-            return trial
-    raise ValueError(f"There is no trial {name!r}; choose from {', '.join(trial.name for trial in TRIALS)}.")
+    known = {trial.name: trial for trial in (*TRIALS, *SCALING)}
+    if name not in known:
+        check_known("trial", [name], [trial.name for trial in TRIALS])
+    return known[name]

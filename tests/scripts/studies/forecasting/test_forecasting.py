@@ -1,15 +1,17 @@
 """Measures of forecasts against known answers, and a whole run on little data."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from forecast import main
+from harness import joined
 from mbagent.models import SimulatorModel, TrainingConfig
 from mbagent_envs import FlierCatcher, GeyserRunner
 from studies.forecasting import measures as m
-from studies.forecasting.experiment import CASES, Score, Settings, plan, run_task
+from studies.forecasting.experiment import CASES, Score, Settings, cells, run_cell
 from studies.forecasting.page import tables, write_page
 
 
@@ -65,30 +67,30 @@ def quick_fits(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_whole_run_becomes_one_page_and_one_table(tmp_path: Path) -> None:
     names = ("GeyserRunner, stochastic", "FlierCatcher")
     settings = Settings(names, steps=(1, 3), timesteps=250, seeds=1, n_starts=25, n_draws=5, episodes=0)
-    outcomes = [run_task(task) for task in plan(settings)]
-    figure = write_page(tmp_path / "report.html", outcomes, settings, "python scripts/forecast.py")
+    results = joined(run_cell(cell) for cell in cells(settings))
+    figure = write_page(tmp_path / "report.html", results, settings, "python scripts/forecast.py")
     assert figure.startswith(b"\x89PNG")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "A model for n" in page
     assert "http" not in page
-    found = tables([score for outcome in outcomes for score in outcome.scores], [])
+    found = tables(results["results"], [])
     assert [(table.name, table.measure) for table in found] == [(names[0], "joint"), (names[1], "marginal")]
-    geysers = {(s.method, s.n): s for s in next(o for o in outcomes if o.task.case.name == names[0]).scores}
-    assert geysers["direct", 1].joint == geysers["iterated", 1].joint  # one step is one step
-    assert geysers["true again", 3].joint == 0.0
-    assert [task.case for task in plan(Settings(seeds=1))] == list(reversed(CASES))
+    joint = {(row["method"], row["n"]): row["joint"] for row in results["results"] if row["case"] == names[0]}
+    assert joint["direct", 1] == joint["iterated", 1]  # one step is one step
+    assert joint["true again", 3] == 0.0
+    assert [cell.case for cell in cells(Settings(seeds=1))] == list(reversed(CASES))
 
 
 @pytest.mark.usefixtures("quick_fits")
 def test_a_planner_plays_with_either_kind_of_forecasts() -> None:
     settings = Settings((CASES[0].name,), steps=(1, 2), timesteps=200, seeds=1, n_starts=5, n_draws=2, episodes=1)
-    returns = run_task(plan(settings)[0]).returns
-    assert [value.forecasts for value in returns] == ["iterated", "direct"]
-    assert all(np.isfinite(value.value) for value in returns)
+    returns = run_cell(cells(settings)[0]).tables["returns"]
+    assert [row["forecasts"] for row in returns] == ["iterated", "direct"]
+    assert all(np.isfinite(row["value"]) for row in returns)
 
 
 def test_a_measure_is_used_only_where_it_exists_for_every_score() -> None:
-    scores = [Score(CASES[2].name, 0, "direct", n, np.nan, inexact, 0.1) for n, inexact in ((1, 0.0), (2, np.nan))]
+    scores = [asdict(Score(CASES[2].name, 0, "direct", n, np.nan, inexact, 0.1)) for n, inexact in ((1, 0.0), (2, np.nan))]
     assert tables(scores, [])[0].measure == "marginal"
     assert tables(scores[:1], [])[0].measure == "inexact"
 

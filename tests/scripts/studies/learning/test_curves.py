@@ -5,24 +5,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from learning_curves import Args, main, plan
-from studies.learning.curves import OURS, RANDOM, Course, run_course
+from learning_curves import Args, cells, main
+from studies.learning.curves import OURS, RANDOM, Cell, run_cell
 from worlds.environments import find_world
 
 CLIFF = find_world("CliffWalking")
 
 
 def test_the_agent_goes_on_learning_from_mark_to_mark() -> None:
-    rows = run_course(Course(CLIFF, OURS, 0, (500, 3000), 2))
+    rows = run_cell(Cell(CLIFF, OURS, 0, (500, 3000), 2)).rows
     assert [row["steps"] for row in rows] == [500, 3000]
     assert rows[-1]["return"] == -13.0
     assert rows[0]["learn_seconds"] < rows[1]["learn_seconds"]
 
 
 def test_baselines_are_trained_for_each_mark_and_random_play_once() -> None:
-    rows = run_course(Course(CLIFF, "PPO", 0, (1000, 2000), 2))
+    rows = run_cell(Cell(CLIFF, "PPO", 0, (1000, 2000), 2)).rows
     assert [row["steps"] for row in rows] == [1000, 2000]
-    (row,) = run_course(Course(CLIFF, RANDOM, 0, (1000, 2000), 2))
+    (row,) = run_cell(Cell(CLIFF, RANDOM, 0, (1000, 2000), 2)).rows
     assert row["return"] < -200.0
 
 
@@ -44,11 +44,11 @@ def test_the_command_draws_a_picture(tmp_path: Path) -> None:
 )
 def test_mistakes_are_named(args: Args, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        plan(args)
+        cells(args)
 
 
 def test_every_agent_plays_every_world() -> None:
-    courses = plan(Args(worlds=("CliffWalking", "Taxi"), seeds=2, marks=(10,)))
-    assert len(courses) == 16
-    assert len({(c.world.name, c.agent, c.seed) for c in courses}) == 16
-    np.testing.assert_array_equal([c.episodes for c in courses], 5)
+    todo = cells(Args(worlds=("CliffWalking", "Taxi"), seeds=2, marks=(10,)))
+    assert len(todo) == 16
+    assert len({(c.world.name, c.agent, c.seed) for c in todo}) == 16
+    np.testing.assert_array_equal([c.episodes for c in todo], 5)

@@ -11,7 +11,7 @@ from mbagent.models.modules import Influence
 from mbagent_envs import FlierCatcher
 from pruning import main
 from studies.pruning import measures
-from studies.pruning.experiment import Key, Outcome, Row, Settings, Task
+from studies.pruning.experiment import Cell, Key, Outcome, Row, Settings
 from studies.pruning.measures import SizeRow
 from studies.pruning.page import exponent, markdown_table, summary, summary_rows, write_page
 from studies.pruning.picture import draw_modules
@@ -51,7 +51,7 @@ def test_a_perfect_model_agrees_with_the_truth() -> None:
 def outcome(seed: int, change: float) -> Outcome:
     """As if FlierCatcher had been pruned without any loss of what is true."""
     game, names = FlierCatcher(), tuple(f"observation[{i}]" for i in range(120))
-    found = Outcome(Task("flier_catcher", seed, SETTINGS), names, game.action_names)
+    found = Outcome(Cell("flier_catcher", seed, SETTINGS), names, game.action_names)
     for number, key in enumerate(KEYS):
         speeds = 8.0, 4.0, 3.0, 2.0 / (1 + number)
         found.rows.append(Row("flier_catcher", seed, *key, 100, 0.9, 0.5, 0.1, 0.1, *speeds, *([0.5] * 8)))

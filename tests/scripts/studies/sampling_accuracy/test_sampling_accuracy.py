@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from harness import joined, write_csv
 from mbagent.models.config import NeuralConfig
 from mbagent.models.training import TrainingConfig
 from sampling_accuracy import main
 from studies.sampling_accuracy import experiment, samplers
 from studies.sampling_accuracy.boltzmann import BoltzmannConfig
 from studies.sampling_accuracy.data import DataOptions, generate
-from studies.sampling_accuracy.experiment import Outcome, Part, Settings, plan, run_task
+from studies.sampling_accuracy.experiment import Part, Settings, cells, run_cell
 from studies.sampling_accuracy.measures import total_variation, valid_mass
 from studies.sampling_accuracy.page import write_page
 from studies.sampling_accuracy.results import (
@@ -21,7 +22,6 @@ from studies.sampling_accuracy.results import (
     load_scores,
     load_settings,
     save_points,
-    save_scores,
     save_settings,
 )
 from studies.sampling_accuracy.samplers import COMBINED, PREDICTOR, FitOptions
@@ -141,12 +141,12 @@ def quick_fits(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("quick_fits")
 def test_a_whole_run_becomes_one_page_and_one_table(tmp_path: Path) -> None:
     settings = Settings(trials=("1a", "1b"), seeds=1, n_draws=20, fit=FitOptions(iterations=2))
-    outcomes: list[Outcome] = [run_task(task) for task in plan(settings)]
-    scores, points = experiment.collect(outcomes), first_points(outcomes)
-    save_scores(tmp_path / "results.csv", scores)
+    results = [run_cell(cell) for cell in cells(settings)]
+    rows, points = joined(results)["results"], first_points(results)
+    write_csv(tmp_path / "results.csv", rows)
     save_points(tmp_path / "points.npz", points)
     again, points_again = load_scores(tmp_path / "results.csv"), load_points(tmp_path / "points.npz")
-    assert [repr(score) for score in again] == [repr(score) for score in scores]  # NaN equals itself here
+    assert [repr(score) for score in again] == [repr(Score(**row)) for row in rows]  # NaN equals itself here
     assert points_again.keys() == points.keys()
     changed = [replace(score("2a", name, 0.8), trial=t) for name in ("as scored", "one sweep") for t in ("2a", "3")]
     growing = [score(trial, COMBINED, 0.8, parameters=9, sample_microseconds=1.0) for trial in ("d = 2", "d = 4")]
@@ -157,8 +157,8 @@ def test_a_whole_run_becomes_one_page_and_one_table(tmp_path: Path) -> None:
     assert "http" not in page
     lines = (tmp_path / "results.csv").read_text(encoding="utf-8").splitlines()
     assert len(lines) == 1 + 2 * 18
-    assert plan(Settings())[0].trial == "3"
-    assert len(plan(Settings())) == 2 * 60 + 3 * 20 + 5
+    assert cells(Settings())[0].trial == "3"
+    assert len(cells(Settings())) == 2 * 60 + 3 * 20 + 5
     assert find_trial("3").seeds == 5
 
 

@@ -8,8 +8,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from external_benchmark import Args, main, plan
-from studies.external.experiment import IMAGINED, OURS, TRUE, Task, run_task
+from external_benchmark import Args, cells, main
+from harness import write_csv
+from studies.external import IMAGINED, OURS, TRUE, Cell, markdown_table, run_cell
 from worlds.environments import CONTINUOUS, WORLDS, World, find_world, for_networks, scale_of
 
 LAKE = find_world("FrozenLake 4x4")
@@ -17,7 +18,7 @@ LAKE = find_world("FrozenLake 4x4")
 
 @pytest.mark.parametrize("agent", [OURS, TRUE, "PPO", IMAGINED, "random"])
 def test_agents_are_scored_on_one_scale(agent: str) -> None:
-    row = run_task(Task(LAKE, agent, seed=0, steps=10_000, episodes=5, baseline_steps=1000))
+    (row,) = run_cell(Cell(LAKE, agent, seed=0, steps=10_000, episodes=5, baseline_steps=1000)).rows
     assert row["optimum"] == pytest.approx(0.744, abs=0.001)
     assert row["random"] == pytest.approx(0.0139, abs=0.001)
     assert row["episodes"] == 5
@@ -59,21 +60,21 @@ def test_images_are_shown_to_networks_as_small_numbers() -> None:
 
 
 def test_what_is_asked_for_is_planned() -> None:
-    tasks = plan(Args(worlds=("FrozenLake 8x8",), agents=(OURS, "PPO"), seeds=2, first_seed=5, baseline_steps=100))
-    assert [(task.agent, task.seed, task.steps, task.baseline_steps) for task in tasks] == [
+    todo = cells(Args(worlds=("FrozenLake 8x8",), agents=(OURS, "PPO"), seeds=2, first_seed=5, baseline_steps=100))
+    assert [(cell.agent, cell.seed, cell.steps, cell.baseline_steps) for cell in todo] == [
         (agent, seed, 50_000, 100) for agent in (OURS, "PPO") for seed in (5, 6)
     ]
-    full = plan(Args(full=True, agents=(OURS,)))
+    full = cells(Args(full=True, agents=(OURS,)))
     here = [world for world in WORLDS if world.missing is None]
     assert len(full) == 5 * len(here)
-    assert {task.episodes for task in full} == {100}
+    assert {cell.episodes for cell in full} == {100}
     for wrong, message in (
         (Args(worlds=("Nowhere",)), "no world 'Nowhere'"),
         (Args(agents=("Nobody",)), "no agent 'Nobody'"),
         (Args(seeds=0), "--seeds"),
     ):
         with pytest.raises(ValueError, match=message):
-            plan(wrong)
+            cells(wrong)
 
 
 def test_the_command_writes_a_line_for_each_case(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -114,3 +115,24 @@ def test_rddl_tables_are_the_domains_rules(name: str) -> None:
     actions = np.arange(len(states)) % len(env.assignments)
     found = model[0].successors(states, actions, 64, 0)
     np.testing.assert_allclose(np.add.reduceat(found.probabilities, found.offsets[:-1]), 1.0)
+
+
+def rows(world: str, agent: str, normalised: list[float], positive: float = 0.5) -> list[dict[str, object]]:
+    more = {"positive": positive, "learn_seconds": 2.0, "milliseconds": 0.5}
+    return [{"world": world, "agent": agent, "normalised": value, **more} for value in normalised]
+
+
+def test_the_documentations_table_holds_the_last_of_each(tmp_path: Path) -> None:
+    nan = float("nan")
+    first = [
+        *rows("Taxi", "mbagent", [0.1, 0.2]),
+        *rows("MiniGrid Empty", "mbagent", [nan, nan], 0.998),
+        *rows("Taxi", "PPO", [0.3]),
+    ]
+    write_csv(tmp_path / "first.csv", first)
+    second = rows("Taxi", "mbagent", [0.5, 0.7, 0.9])
+    second[0] |= {"learn_seconds": 40.0, "milliseconds": 60.0}
+    write_csv(tmp_path / "second.csv", second)
+    lines = markdown_table([tmp_path / "first.csv", tmp_path / "second.csv"]).splitlines()
+    assert lines[0] == "| | mbagent | PPO | learning, s | decision, ms |"
+    assert lines[2:] == ["| Taxi | 0.700 | 0.300 | 2.0 | 0.50 |", "| MiniGrid Empty | 99.8% | – | 2.0 | 0.50 |"]
