@@ -17,6 +17,7 @@ import tyro
 from rich.console import Console
 
 from mbagent import files
+from mbagent.evaluation.report import Table
 from mbagent.evaluation.statistics import interquartile_mean
 from studies.comparison.records import AGENT, LEARNED_REWARD, TRUE_MODEL
 from studies.external import markdown_table as external_table
@@ -80,12 +81,12 @@ def new_goals(scores: Scores, case: str) -> str:
 def table(scores: Scores, others: Scores) -> str:
     """The table, as Markdown."""
     names = [*COLUMNS, *BASELINES, "worst new goal"]
-    lines = ["| | " + " | ".join(names) + " |", "| --- |" + " ---: |" * len(names)]
+    lines = []
     for case in CASES:
         cells = [score(scores.get((case.key, agent, "default"), [])) for agent in COLUMNS.values()]
         cells += [score(others.get((case.key, agent, "default"), [])) for agent in BASELINES]
-        lines.append(f"| {case.title} | " + " | ".join([*cells, new_goals(scores, case.key)]) + " |")
-    return "\n".join(lines)
+        lines.append([case.title, *cells, new_goals(scores, case.key)])
+    return Table(["", *names], lines).markdown()
 
 
 def _fill(document: Path, tables: Mapping[str, str]) -> None:

@@ -1,4 +1,4 @@
-"""What every report page shares: the template engine, how numbers are written, and how pictures are embedded."""
+"""Report pages: tables and figures on one self-contained HTML page, and how numbers are written in them."""
 
 from __future__ import annotations
 
@@ -6,15 +6,19 @@ import base64
 import io
 import math
 import platform
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
+from mbagent import files
 from mbagent.evaluation.statistics import Interval
 
 FIGURE_STYLE: Any = {
@@ -32,7 +36,91 @@ FIGURE_STYLE: Any = {
 }
 """Settings for ``matplotlib.rc_context``: every figure of every page looks alike."""
 
+_TEMPLATES = Path(__file__).parent / "templates"
 _SHOWN_VERSIONS = ("gymnasium", "stable-baselines3", "torch", "numpy", "numba")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of text.
+
+    Attributes:
+        columns: titles.
+        rows: cells, each row as long as ``columns``; the first cell names the row.
+    """
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+    @classmethod
+    def of(cls, rows: Sequence[Mapping[str, Any]], shown: Callable[[Any], str]) -> Table:
+        """Rows of equal keys as a table, each value as ``shown`` writes it."""
+        return cls(list(rows[0]), [[shown(value) for value in row.values()] for row in rows])
+
+    def markdown(self, names: int = 1) -> str:
+        """The table as Markdown; all but the first ``names`` columns are set to the right."""
+        titles, marks = "| " + " | ".join(self.columns) + " |", ["---"] * names + ["---:"] * (len(self.columns) - names)
+        lines = [titles.replace("|  |", "| |"), "| " + " | ".join(marks) + " |"]
+        return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in self.rows)])
+
+
+@dataclass(frozen=True)
+class Card:
+    """One box of a page: a title, a figure, a table, notes and a list, each where there is one.
+
+    Attributes:
+        title: of the box.
+        figure: PNG.
+        about: what the figure shows, for who does not see it.
+        table: below the figure.
+        notes: paragraphs in small print; text between backticks is set as code.
+        lines: set as code, one below another.
+    """
+
+    title: str = ""
+    figure: bytes | None = None
+    about: str = ""
+    table: Table | None = None
+    notes: Sequence[str] = ()
+    lines: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading with the boxes below it."""
+
+    title: str
+    cards: Sequence[Card]
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page of results.
+
+    Attributes:
+        name: for the window.
+        title: its heading.
+        intro: first paragraph.
+        sections: what was found.
+        command: the command line that makes it again.
+        methods: how it was measured: paragraphs by their headings.
+    """
+
+    name: str
+    title: str
+    intro: str
+    sections: Sequence[Section]
+    command: str
+    methods: Mapping[str, str]
+
+    def write(self, path: Path) -> None:
+        """Writes the page, pictures and all, into one file."""
+        files.write(path, render(_TEMPLATES / "page.html.jinja", {"inline": inline}, page=self))
+
+
+def inline(text: str) -> Markup:
+    """Text for HTML; what stands between backticks as code."""
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def render(template: Path, filters: dict[str, Callable[..., Any]] | None = None, **values: Any) -> str:
@@ -44,7 +132,7 @@ def render(template: Path, filters: dict[str, Callable[..., Any]] | None = None,
         **values: what it shows; ``versions``, ``python`` and ``date`` are there already.
     """
     environment = Environment(
-        loader=ChoiceLoader([FileSystemLoader(template.parent), PackageLoader("mbagent.evaluation", "templates")]),
+        loader=FileSystemLoader([template.parent, _TEMPLATES]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -22,7 +22,7 @@ from harness import Result, Row, Run, grouped
 from mbagent.agent import ModelLearningAgent
 from mbagent.evaluation.baselines import BaselineName, as_policy, train_baseline
 from mbagent.evaluation.evaluate import Policy, evaluate_env, milliseconds_per_decision, random_policy
-from mbagent.evaluation.report import format_number
+from mbagent.evaluation.report import Table, format_number
 from mbagent.evaluation.statistics import interquartile_interval, interquartile_mean
 from mbagent.learned_env import LearnedEnv
 from worlds.environments import ARCADE, CONTINUOUS, WORLDS, World, exact_world, for_networks, scale_of, true_model
@@ -236,13 +236,13 @@ def markdown_table(paths: Sequence[Path]) -> str:
                 new.setdefault((row["world"], row["agent"]), []).append(row)
         found |= new
     agents = [agent for agent in AGENTS if any(agent == other for _, other in found)]
-    lines = ["| | " + " | ".join([*agents, "learning, s", "decision, ms"]) + " |", "| --- |" + " ---: |" * (len(agents) + 2)]
+    lines = []
     for world in WORLDS:
         groups = {agent: found.get((world.name, agent), []) for agent in agents}
         if any(groups.values()):
             ours = [_median(groups.get(OURS, []), name, digits) for name, digits in (("learn_seconds", 1), ("milliseconds", 2))]
-            lines.append(f"| {world.name} | " + " | ".join([*(_score(group) for group in groups.values()), *ours]) + " |")
-    return "\n".join(lines)
+            lines.append([world.name, *(_score(group) for group in groups.values()), *ours])
+    return Table(["", *agents, "learning, s", "decision, ms"], lines).markdown()
 
 
 def _score(rows: Sequence[dict[str, str]]) -> str:

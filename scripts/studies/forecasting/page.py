@@ -12,10 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from harness import Row, Tables
-from mbagent import files
-from mbagent.evaluation.report import FIGURE_STYLE, render, to_png
+from mbagent.evaluation.report import FIGURE_STYLE, Card, Page, Section, format_interval, format_number, to_png
+from mbagent.evaluation.report import Table as TextTable
 from mbagent.evaluation.statistics import Interval, mean_interval
-from studies import TEMPLATES
 from studies.forecasting.experiment import CASES, Method, Settings
 
 MEASURES: dict[str, str] = {
@@ -83,11 +82,56 @@ def write_page(path: Path, results: Tables, settings: Settings, command: str) ->
     """Writes the HTML page, picture and all, into one file; returns the picture as PNG."""
     found = tables(results["results"], results.get("returns", []))
     figure = draw_errors(found)
-    page = render(
-        TEMPLATES / "forecasts.html.jinja", tables=found, measures=MEASURES, figure=figure, settings=settings, command=command
+    about = "Error of both ways of forecasting against the number of steps, one panel for each game"
+    note = (
+        "Means over seeds with 95% t intervals. Total variation of the joint distribution is exact, over all states of the "
+        f"game; where states are too many to list, the share of {settings.n_draws} draws that miss the only possible state; "
+        "where there never is only one, the total variation of single variables between "
+        f"{settings.n_draws} draws and as many true ones, compared with that of two sets of true draws."
     )
-    files.write(path, page)
+    cards = [Card(figure=figure, about=about, notes=[note]), *(_card(table, settings) for table in found)]
+    section = Section("Error against the number of steps", cards)
+    Page(
+        "Forecasts", "How far ahead models predict", INTRO.format(settings.timesteps), [section], command, _methods(settings)
+    ).write(path)
     return figure
+
+
+INTRO = (
+    "A model of single steps, iterated, adds error to error. Section 4.2 of Braylan and Miikkulainen 2015 names another way: "
+    "a model of its own for each number of steps n, which is given a string of n actions. Its errors do not add up, but what "
+    "it has to learn is harder. Both ways learned from the same {:,} steps of random play and forecast the same strings of "
+    "random actions, from states of random play that was not learned from; the games themselves give the truth."
+)
+
+
+def _methods(settings: Settings) -> dict[str, str]:
+    return {
+        "Models": 'The networks (`model="networks"`): predictor and causal conditioner on flat variables; on planes, weights '
+        "shared over positions, with one block of layers for each action of the string. Each action is a group of inputs of "
+        "its own.",
+        "Cases": f"{settings.n_starts} states of random play; seeds {settings.first_seed} and up.",
+    }
+
+
+def _card(table: Table, settings: Settings) -> Card:
+    """One game's errors as text."""
+    columns = ("n", "Iterated", "A model for n", "Single variables: iterated", "a model for n", "true draws", "Its fit, seconds")
+    rows = []
+    for line in table.lines:
+        errors = [line.errors[method] for method in ("iterated", "direct")]
+        cells = [f"{format_number(error.estimate, 4)} ({format_interval(error, 4)})".replace(" ()", "") for error in errors]
+        cells += [format_number(line.marginals[method].estimate, 4) for method in _LOOKS]
+        rows.append([str(line.n), *cells, format_number(line.fit_seconds, 1)])
+    note = f"First two columns: {MEASURES[table.measure]}. {table.seeds} seed(s)."
+    if table.returns:
+        iterated, direct = (format_number(table.returns[kind].estimate, 1) for kind in ("iterated", "direct"))
+        note += (
+            f" Mean return of flat Monte Carlo over {settings.episodes} episodes a seed: {iterated} with the iterated model, "
+            f"{direct} with a model for each n "
+            '(`policy_kwargs={"forecasts": "direct"}`).'
+        )
+    return Card(table.name, table=TextTable(columns, rows), notes=[note])
 
 
 def draw_errors(found: Sequence[Table]) -> bytes:

@@ -12,9 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
 
-from mbagent import files
-from mbagent.evaluation.report import FIGURE_STYLE, format_number, render, to_png
-from studies import TEMPLATES
+from mbagent.evaluation.report import FIGURE_STYLE, Card, Page, Section, Table, format_number, to_png
 from studies.model_accuracy.studies import STUDIES
 
 Row: TypeAlias = Mapping[str, Any]
@@ -63,20 +61,27 @@ def write_page(path: Path, results: Mapping[str, Sequence[Row]], accuracy: Seque
     """Writes the page with everything measured; returns its pictures by name."""
     tables = {study: averaged(study, rows) for study, rows in results.items() if rows}
     pictures = {study: draw(tables[study]) for study, draw in _PICTURES.items() if study in tables}
-    exponents = {name: slope(tables["cost"], name) for name in ("fit seconds", "sample microseconds")} if "cost" in tables else {}
-    docs = {study: (STUDIES[study].__doc__ or "").splitlines()[0] for study in tables}
-    page = render(
-        TEMPLATES / "models.html.jinja",
-        filters={"shown": shown},
-        accuracy=accuracy,
-        tables=tables,
-        pictures=pictures,
-        exponents=exponents,
-        docs=docs,
-        command=command,
-    )
-    files.write(path, page)
+    sections = [_exact_states(accuracy)] if accuracy else []
+    for study, rows in tables.items():
+        title = (STUDIES[study].__doc__ or "").splitlines()[0]
+        card = Card(figure=pictures.get(study), table=Table.of(rows, shown), notes=_exponents(rows) if study == "cost" else ())
+        sections.append(Section(title, [card]))
+    intro = "Models learn worlds from random play and are tested on new random play, on layouts that they have not seen."
+    Page("Models", "How exactly models predict", intro, sections, command, {}).write(path)
     return pictures
+
+
+def _exact_states(accuracy: Sequence[Row]) -> Section:
+    note = (
+        "Means over seeds. Likeliest and sampled: share of transitions whose certain factors are all predicted; transitions to a "
+        "new layout do not count."
+    )
+    return Section("Exact next states", [Card(table=Table.of(accuracy, shown), notes=[note])])
+
+
+def _exponents(rows: Sequence[Row]) -> list[str]:
+    fit, draw = (format_number(slope(rows, name), 2) for name in ("fit seconds", "sample microseconds"))
+    return [f"Exponents of d: fit {fit}, one sampled state {draw}."]
 
 
 def draw_changes(rows: Sequence[Row]) -> bytes:

@@ -11,9 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
 
-from mbagent import files
-from mbagent.evaluation.report import FIGURE_STYLE, format_number, render, to_png
-from studies import TEMPLATES
+from mbagent.evaluation.report import FIGURE_STYLE, Card, Page, Section, Table, format_number, to_png
 
 Row: TypeAlias = Mapping[str, Any]
 
@@ -114,6 +112,10 @@ def write_page(path: Path, tables: Mapping[str, Sequence[Row]], command: str) ->
     """
     full = {name: list(tables[name]) for name in TITLES if tables.get(name)}
     pictures = {"regret": draw_regret(full["regret"])} if "regret" in full else {}
-    given = {"tables": full, "pictures": pictures, "titles": TITLES, "notes": NOTES, "command": command}
-    files.write(path, render(TEMPLATES / "planning.html.jinja", filters={"shown": shown}, **given))
+    sections = [
+        Section(TITLES[name], [Card(figure=pictures.get(name), table=Table.of(rows, shown), notes=[NOTES[name]])])
+        for name, rows in full.items()
+    ]
+    intro = "Every table is of one run on one machine."
+    Page("Planning", "Speed and quality of planning and sampling", intro, sections, command, {}).write(path)
     return pictures

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib as mpl
@@ -12,10 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mbagent import files
-from mbagent.evaluation.report import FIGURE_STYLE, format_number, render, to_png
+from mbagent.evaluation.report import FIGURE_STYLE, Card, Page, Section, Table, format_number, to_png
 from mbagent.evaluation.statistics import Interval, mean_interval
-from studies import TEMPLATES
 from studies.pruning.experiment import Key, Outcome, Settings, Way
 from studies.pruning.measures import SizeRow
 from studies.pruning.picture import draw_modules
@@ -59,30 +56,6 @@ COLOURS: dict[Way, str] = {"by size": "#9aa5b1", "by evidence": "#0b6e4f"}
 Cells = dict[str, float]
 
 
-@dataclass(frozen=True)
-class Section:
-    """One game on the page.
-
-    Attributes:
-        title: of the game.
-        seeds: number of repetitions.
-        rows: for each share and way: these and the means over seeds, by column.
-        others: microseconds of a next state by other networks, and how many times faster the best row is.
-        pictures: (caption, picture) of the curves, the sums over paths and the modules, these of the first seed.
-        modules, groups: of what the last map shows.
-        shown: that share and way.
-    """
-
-    title: str
-    seeds: int
-    rows: list[tuple[Key, Cells]]
-    others: dict[str, tuple[float, float]]
-    pictures: dict[str, tuple[str, bytes]]
-    modules: list[str]
-    groups: list[str]
-    shown: Key
-
-
 def summary(outcomes: Sequence[Outcome]) -> list[tuple[Key, Cells]]:
     """Means over seeds for each share and way, the change of the return in the same episodes, and the speed-up."""
     result: list[tuple[Key, Cells]] = []
@@ -112,7 +85,7 @@ def summary_rows(outcomes: Sequence[Outcome]) -> list[dict[str, str | int | floa
 def markdown_table(paths: Sequence[Path]) -> str:
     """The README's table, from files of ``summary_rows``."""
     titles = ["", "pruned", "connections", "return", "change", "nats lost", "µs", "precision", "recall", "modules"]
-    lines = ["| " + " | ".join(titles) + " |", "| --- | --- |" + " ---: |" * (len(titles) - 2)]
+    lines = []
     for path in paths:
         with path.open(encoding="utf-8", newline="") as file:
             for row in csv.DictReader(file):
@@ -122,8 +95,8 @@ def markdown_table(paths: Sequence[Path]) -> str:
                 shown += [format_number(cell["connections"], 0), format_number(cell["returned"], 3), change]
                 shown += [format_number(cell[name], digits) for name, digits in (("log_likelihood", 4), ("used", 2))]
                 shown += [format_number(cell[name], 2) for name in ("precision", "recall", "modules")]
-                lines.append("| " + " | ".join(shown) + " |")
-    return "\n".join(lines)
+                lines.append(shown)
+    return Table(titles, lines).markdown(names=2)
 
 
 def write_page(
@@ -135,19 +108,55 @@ def write_page(
     for game in settings.games:
         mine = sorted((o for o in outcomes if o.cell.game == game), key=lambda o: o.cell.seed)
         if mine:
-            sections.append(section_of(mine))
-            pictures |= {f"{game}_{name}": png for name, (_, png) in sections[-1].pictures.items()}
-    page = render(
-        TEMPLATES / "pruning.html.jinja",
-        sections=sections,
-        columns=COLUMNS,
-        settings=settings,
-        command=command,
-        sizes=sizes,
-        exponents={name: exponent(sizes, name) for name in ("whole", "pruned")} if len({row.d for row in sizes}) > 1 else {},
-    )
-    files.write(path, page)
+            section, drawn = section_of(mine)
+            sections.append(section)
+            pictures |= {f"{game}_{name}": png for name, png in drawn.items()}
+    if sizes:
+        sections.append(_sizes(sizes))
+    Page("Pruning", "What is left after pruning", _intro(settings), sections, command, METHODS).write(path)
     return pictures
+
+
+METHODS = {
+    "Figures 11 and 12": "Sums of absolute weights over all paths from an input (x) to an output (y), on a square root scale, "
+    "first seed; without variables that nothing leads to or from in the end."
+}
+
+NOTE = (
+    "Means over {} seed(s). Change: of the return in the same episodes, with the half-width of its 95% interval over episodes. "
+    "Nats lost: log-likelihood a transition below the true model's, on play that was not learned from. Error of single "
+    "variables: total variation between 200 draws of the model and of the game, which random draws alone make larger than 0. "
+    "µs: processor time of one next state in a batch of 1,024; all asked: every variable that has a group in the conditioner "
+    "is drawn from it; matrices and connections: without those that the predictor is sure of; as used: tables, and lists of "
+    "connections where a variable has too many parents. Times the speed: of the unpruned networks, all asked. Total variation: "
+    "between tables and whole matrices, upper 95% limit. Parents: state variables that a variable depends on. Precision and "
+    "recall: of these against the true dependencies. Modules found: share of the true ones, found exactly."
+)
+
+
+def _intro(settings: Settings) -> str:
+    own = ", the paper's own" if settings.networks == "paper" else ""
+    plays = f" and plays the same {settings.episodes} episodes each time" if settings.episodes else ""
+    return (
+        "The smallest weights of predictor and conditioner are removed, a few at a time, while what is left is trained on "
+        f"(section 5 of Braylan and Miikkulainen 2015). Networks on flat variables{own}, learned from {settings.timesteps:,} "
+        f"steps of random play; the same learned agent is pruned to each share{plays}. By size: this share, and no more. By "
+        "evidence, the default of `agent.prune`: then also what the transitions do not call for."
+    )
+
+
+def _sizes(sizes: Sequence[SizeRow]) -> Section:
+    """Cost against the number of variables."""
+    columns = ("d", "Seed", "Connections left", "µs before pruning", "µs after")
+    rows = [
+        [str(row.d), str(row.seed), format_number(row.connections, 0), format_number(row.whole, 3), format_number(row.pruned, 3)]
+        for row in sizes
+    ]
+    note = "A world of d bits of which at most eight are ever open, 90% removed."
+    if len({row.d for row in sizes}) > 1:
+        whole, pruned = (format_number(exponent(sizes, name), 2) for name in ("whole", "pruned"))
+        note += f" Cost grows as d to the power of {whole} before pruning and {pruned} after."
+    return Section("Cost against the number of variables", [Card(table=Table(columns, rows), notes=[note])])
 
 
 def exponent(rows: Sequence[SizeRow], name: str) -> float:
@@ -155,21 +164,42 @@ def exponent(rows: Sequence[SizeRow], name: str) -> float:
     return float(np.polyfit(np.log([row.d for row in rows]), np.log([getattr(row, name) for row in rows]), 1)[0])
 
 
-def section_of(outcomes: Sequence[Outcome]) -> Section:
-    """What the page says about one game."""
+def section_of(outcomes: Sequence[Outcome]) -> tuple[Section, dict[str, bytes]]:
+    """What the page says about one game, and its pictures by name: the sums over paths and the modules are the first seed's."""
     rows, first = summary(outcomes), outcomes[0]
     whole, (shown, best) = rows[0][0], rows[-1]
     middle = next((key for key, _ in rows if key[0] >= 0.9), shown)
-    pictures: dict[str, tuple[str, bytes]] = {"curves": ("What is left against the pruned fraction", draw_curves(rows))}
+    pictures = {"curves": draw_curves(rows)}
+    notes = [NOTE.format(len(outcomes))]
+    if others := {name: float(np.mean([o.others[name] for o in outcomes])) for name in first.others}:
+        costs = [f"{name} {cost:.1f} µs, {cost / best['used']:.0f} times that of the last row" for name, cost in others.items()]
+        notes.append(f"In the same run: {'; '.join(costs)}.")
+    cards = [Card(figure=pictures["curves"], about="What is left against the pruned fraction", table=_table(rows), notes=notes)]
     for number, key in enumerate(dict.fromkeys((whole, middle, shown))):
-        pictures[f"paths_{number}"] = (captioned(key), draw_paths(first, key, linked(first, shown)))
+        pictures[f"paths_{number}"] = draw_paths(first, key, linked(first, shown))
+        caption = captioned(key)
+        cards.append(Card(caption[0].upper() + caption[1:], pictures[f"paths_{number}"]))
     if (game := game_of(find_case(first.cell.game))) is not None:
-        picture = draw_modules(first.linked[shown], game.observation_space.shape)
-        pictures["modules"] = (f"Modules, {captioned(shown)}", picture)
-    others = {name: float(np.mean([o.others[name] for o in outcomes])) for name in first.others}
-    title = find_case(first.cell.game).title
-    ratios = {name: (cost, cost / best["used"]) for name, cost in others.items()}
-    return Section(title, len(outcomes), rows, ratios, pictures, first.modules[shown], first.groups[shown], shown)
+        pictures["modules"] = draw_modules(first.linked[shown], game.observation_space.shape)
+        cards.append(Card(f"Modules, {captioned(shown)}", pictures["modules"]))
+    about = "Variables that lead to each other in a step, and what leads to them."
+    cards.append(Card(f"Modules, {100 * shown[0]:.0f}% removed", notes=[about], lines=first.modules[shown] or ["None."]))
+    about = "Variables that are drawn together, given state and action: numbered frames in the picture."
+    cards.append(Card("Drawn together", notes=[about], lines=first.groups[shown] or ["None."]))
+    return Section(find_case(first.cell.game).title, cards), pictures
+
+
+def _table(rows: Sequence[tuple[Key, Cells]]) -> Table:
+    """The summary as text."""
+    lines = [
+        [
+            f"{key[0]:.0%}",
+            key[1] if key[0] else "",
+            *(format_number(cells[name], digits) for name, (_, digits) in COLUMNS.items()),
+        ]
+        for key, cells in rows
+    ]
+    return Table(["Pruned", "", *(title for title, _ in COLUMNS.values())], lines)
 
 
 def captioned(key: Key) -> str:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from mbagent.evaluation.report import Table
 from mbagent.evaluation.statistics import Interval, mean_interval
 from studies.sampling_accuracy.experiment import FEW_ITERATIONS
 from studies.sampling_accuracy.samplers import CAUSAL, COMBINED, PREDICTOR
@@ -102,7 +103,7 @@ def markdown_table(scores: Sequence[Score]) -> str:
         return "–" if np.isnan(estimate) else f"{estimate:.{digits}f}"
 
     names = ("predictor, paper", "here", "combined, paper", "here", "causal: Pearson", "total variation", "valid mass")
-    lines = ["| trial | " + " | ".join(names) + " |", "| --- |" + " ---: |" * len(names)]
+    lines = []
     for trial in TRIALS:
         cells = [
             f"{trial.paper_predictor:.2f}",
@@ -113,8 +114,8 @@ def markdown_table(scores: Sequence[Score]) -> str:
             mean(trial, CAUSAL, "exact", "variation", 4),
             mean(trial, CAUSAL, "exact", "valid", 4),
         ]
-        lines.append(f"| {trial.name} (d = {trial.options.d}, c = {trial.options.c}) | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        lines.append([f"{trial.name} (d = {trial.options.d}, c = {trial.options.c})", *cells])
+    return Table(["trial", *names], lines).markdown()
 
 
 @dataclass(frozen=True)
