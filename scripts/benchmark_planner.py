@@ -23,6 +23,7 @@ from typing import get_args
 import torch
 
 from harness import Row, Run, Tables, check_known, run_command
+from studies.planning.coupled import compare_values
 from studies.planning.latency import SETTINGS, steady
 from studies.planning.latency import measure as measure_latency
 from studies.planning.network_search import EFFORTS, measure_own, ratios, rows_of_mctx
@@ -33,7 +34,7 @@ from studies.planning.quality import TOY_TEXT, play_game, play_table, scales, su
 from studies.planning.regret import Settings, compare
 from studies.planning.sampling import compare_short_cut, compare_with_naive
 from studies.planning.start import GAMES, first_decisions
-from worlds.coupled import WORLDS, compare_values
+from worlds.coupled import COUPLED
 from worlds.synthetic_dbn import Sampler, trained
 
 Say = Callable[[str], None]
@@ -85,7 +86,7 @@ def measure_quality(args: Args, say: Say) -> Tables:
 def measure_crowds(args: Args, say: Say) -> Tables:
     """Planning among many noisy variables, without and with values learned in imagination."""
     rows: list[Row] = []
-    for make in WORLDS:
+    for make in COUPLED:
         world = make()
         say(f"crowds: {world.name}")
         rows += compare_values(world, args.first_seed + 1000)

@@ -17,11 +17,12 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from harness import Run, check_known, run_cells, run_command
+from harness import Run, check_known, find, run_cells, run_command
 from mbagent.exploration import EXPLORATIONS
 from studies.learning.coverage import Cell, draw_coverage, run_cell, show
-from worlds.distractors import BESIDES, BesideWorld
-from worlds.environments import exact_world, find_world
+from worlds.distractors import DISTRACTORS, DistractorWorld
+from worlds.known_rules import exact_world
+from worlds.registry import REGISTRY, World
 
 
 @dataclass(frozen=True)
@@ -51,10 +52,10 @@ def cells(args: Args, run: Run | None = None) -> list[Cell]:
     check_known("exploration", args.explorations, EXPLORATIONS)
     if min(args.seeds, *args.marks) < 1 or list(args.marks) != sorted(set(args.marks)):
         raise ValueError("--seeds must be at least 1, and --marks ascending numbers of steps.")
-    made_up = {world.name: world for world in BESIDES}
-    worlds = [made_up[name] if name in made_up else find_world(name) for name in args.worlds]
+    known: dict[str, World | DistractorWorld] = {**REGISTRY, **{world.name: world for world in DISTRACTORS}}
+    worlds = [find("world", name, known) for name in args.worlds]
     for world in worlds:
-        if isinstance(world, BesideWorld):
+        if isinstance(world, DistractorWorld):
             continue
         if world.missing:
             raise ValueError(f'{world.name} needs pip install "mbagent[{world.missing}]".')

@@ -21,7 +21,7 @@ from pathlib import Path
 
 from harness import Run, check_known, run_cells, run_command
 from studies.external import AGENTS, TRUE, Cell, run_cell, show
-from worlds.environments import WORLDS, find_world
+from worlds.registry import WORLDS, find_world
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from harness import Run, check_known, run_cells, run_command
 from studies.learning.curves import PLAYERS, Cell, draw_curves, run_cell, show
-from worlds.environments import find_world
+from worlds.registry import find_world
 
 QUICK, FULL = (1000, 5000), (10_000, 30_000, 100_000)
 

@@ -25,7 +25,8 @@ from mbagent.evaluation.evaluate import Policy, evaluate_env, milliseconds_per_d
 from mbagent.evaluation.report import Table, format_number
 from mbagent.evaluation.statistics import interquartile_interval, interquartile_mean
 from mbagent.learned_env import LearnedEnv
-from worlds.environments import ARCADE, CONTINUOUS, WORLDS, World, exact_world, for_networks, scale_of, true_model
+from worlds.known_rules import exact_world, scale_of, true_model
+from worlds.registry import ARCADE, CONTINUOUS, WORLDS, World, for_networks
 
 OURS, TRUE, IMAGINED = "mbagent", "mbagent, true model", "PPO in LearnedEnv"
 AGENTS = (OURS, TRUE, "PPO", "DQN", IMAGINED, "random")

@@ -1,26 +1,17 @@
-"""Worlds of many noisy variables, too large to solve: what values learned in imagination are worth there."""
+"""Worlds of many noisy, weakly coupled variables, too large to solve."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from harness import Row
 from mbagent.models.base import Actions, Bools, Floats, Randomness, States, Successors, as_keys
 from mbagent.models.known import KnownModel
 from mbagent.models.systematic import independent_successors
 from mbagent.planning.goal import Goal
-from mbagent.planning.mcts import MctsPlanner
-from mbagent.planning.planner import PlannerSettings
-from mbagent_envs.random_keys import derive, uniforms
-
-EPISODES, STEPS = 16, 40
-"""Episodes played side by side, and their length."""
-
-_SALT = 0xC40D
+from mbagent_envs.random_keys import uniforms
 
 
 class IndependentModel(KnownModel):
@@ -57,7 +48,7 @@ class IndependentModel(KnownModel):
 
 
 @dataclass(frozen=True)
-class World:
+class CoupledWorld:
     """What is played.
 
     Attributes:
@@ -77,7 +68,7 @@ def _bits(on: Floats) -> Floats:
     return np.stack([1.0 - on, on], axis=2)
 
 
-def corridor(n_lights: int = 12, cells: int = 12) -> World:
+def corridor(n_lights: int = 12, cells: int = 12) -> CoupledWorld:
     """A corridor whose last cell is to be reached and kept; many lights beside it flicker and mean nothing."""
 
     def chances(states: States, actions: Actions) -> Floats:
@@ -92,10 +83,10 @@ def corridor(n_lights: int = 12, cells: int = 12) -> World:
     start[:, 1:] = np.random.default_rng(0).integers(0, 2, size=(64, n_lights))
     start[:, 0] = cells - 3
     model = IndependentModel((cells, *(2,) * n_lights), 3, chances)
-    return World("corridor with lights", model, lambda s, a, n: (n[:, 0] == cells - 1).astype(np.float64), start)
+    return CoupledWorld("corridor with lights", model, lambda s, a, n: (n[:, 0] == cells - 1).astype(np.float64), start)
 
 
-def ring(n: int = 16) -> World:
+def ring(n: int = 16) -> CoupledWorld:
     """Machines in a ring that fail, the sooner the more their neighbour has failed; one can be started anew in each step."""
 
     def chances(states: States, actions: Actions) -> Floats:
@@ -105,10 +96,12 @@ def ring(n: int = 16) -> World:
         return _bits(on)
 
     model = IndependentModel((2,) * n, n + 1, chances)
-    return World("ring of machines", model, lambda s, a, y: y.sum(axis=1) - 0.75 * (a > 0), np.ones((1, n), dtype=np.int64))
+    return CoupledWorld(
+        "ring of machines", model, lambda s, a, y: y.sum(axis=1) - 0.75 * (a > 0), np.ones((1, n), dtype=np.int64)
+    )
 
 
-def cells(size: int = 4) -> World:
+def cells(size: int = 4) -> CoupledWorld:
     """Conway's game of life with noise; a cell can be set in each step."""
     n = size * size
 
@@ -122,46 +115,9 @@ def cells(size: int = 4) -> World:
         return _bits(on)
 
     start = np.random.default_rng(0).integers(0, 2, size=(64, n))
-    return World("game of life", IndependentModel((2,) * n, n + 1, chances), lambda s, a, y: y.sum(axis=1) - 1.0 * (a > 0), start)
+    return CoupledWorld(
+        "game of life", IndependentModel((2,) * n, n + 1, chances), lambda s, a, y: y.sum(axis=1) - 1.0 * (a > 0), start
+    )
 
 
-WORLDS = (corridor, ring, cells)
-
-
-def play(world: World, act: Callable[[States], Actions], seed: int) -> Floats:
-    """Return [EPISODES] of each episode."""
-    rng = np.random.default_rng([seed, _SALT])
-    states, total = world.start[rng.integers(len(world.start), size=EPISODES)], np.zeros(EPISODES)
-    for step in range(STEPS):
-        actions = act(states)
-        after, _ = world.model.sample(states, actions, derive(seed, _SALT, step, np.arange(EPISODES)))
-        total += world.goal(states, actions, after)
-        states = after
-    return total
-
-
-def compare_values(world: World, seed: int) -> list[Row]:
-    """Rows of random play, and of the default planner without and with learned values."""
-    rng, rows = np.random.default_rng(seed), []
-    returns = play(world, lambda states: rng.integers(world.model.n_actions, size=len(states)), seed)
-    rows.append(_row(world, "random", returns, 0.0, 0.0))
-    for name, learn_values in (("lookahead", False), ("learned values", True)):
-        planner = MctsPlanner(PlannerSettings(learn_values=learn_values, seed=seed))
-        planner.set_model(world.model, world.start)
-        planner.set_goal(world.goal)
-        planner.plan(world.start[:1])  # compiles
-        planner.set_goal(world.goal)
-        began = time.process_time()
-        planner.plan(world.start[:1])
-        once, began = time.process_time() - began, time.process_time()
-        returns = play(world, lambda states, planner=planner: planner.plan(states).actions, seed)  # type: ignore[misc]
-        rows.append(_row(world, name, returns, once, 1e3 * (time.process_time() - began) / (EPISODES * STEPS)))
-    return rows
-
-
-def _row(world: World, planner: str, returns: Floats, once: float, each: float) -> Row:
-    error = float(returns.std(ddof=1) / np.sqrt(len(returns)))
-    return {
-        "world": world.name, "planner": planner, "return": float(returns.mean()), "error": error, "once for a goal, s": once,
-        "ms a decision": each,
-    }  # fmt: skip
+COUPLED = (corridor, ring, cells)

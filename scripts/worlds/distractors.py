@@ -50,7 +50,7 @@ class Core:
 
 
 @dataclass(frozen=True)
-class BesideWorld:
+class DistractorWorld:
     """A core with bits beside it.
 
     Attributes:
@@ -72,7 +72,7 @@ class BesideWorld:
 
     def make(self) -> gym.Env[Any, Any]:
         """A new copy."""
-        return gym.wrappers.TimeLimit(_BesideEnv(self.known, self.bits), self.limit)
+        return gym.wrappers.TimeLimit(_DistractorEnv(self.known, self.bits), self.limit)
 
     def wrongness(self, model: TransitionModel, numbers: Ints, actions: Actions) -> float:
         """Mean total variation between a model and the rules, for core states [N] and actions [N] with bits drawn by lot."""
@@ -96,7 +96,7 @@ class BesideWorld:
         return len(met) / core.going[core.reachable()].size
 
 
-class _BesideEnv(gym.Env[Any, Any]):
+class _DistractorEnv(gym.Env[Any, Any]):
     def __init__(self, core: Core, bits: int) -> None:
         self.core, self.bits, self.state = core, np.zeros(bits, dtype=np.int64), 0
         self.observation_space = gym.spaces.MultiDiscrete([*(core.values.max(axis=0) + 1), *[2] * bits])
@@ -161,12 +161,12 @@ def nothing(n_actions: int) -> Core:
     return Core(np.zeros((1, 1), dtype=np.int64), np.zeros((1, n_actions), np.int64), np.zeros((1, n_actions), np.bool_))
 
 
-BESIDES = (
-    BesideWorld("chain of 16, 10 lights", lambda: chain(16), 10, 200),
-    BesideWorld("maze 12x12, 10 lights", lambda: grid(12, 0.3), 10, 200),
-    BesideWorld("grid 20x20", lambda: grid(20), 0, 200),
-    BesideWorld("grid 30x30", lambda: grid(30), 0, 200),
-    BesideWorld("key and door 8x8, 8 lights", lambda: key_and_door(8), 8, 200),
-    BesideWorld("14 lights", lambda: nothing(4), 14, 200),
+DISTRACTORS = (
+    DistractorWorld("chain of 16, 10 lights", lambda: chain(16), 10, 200),
+    DistractorWorld("maze 12x12, 10 lights", lambda: grid(12, 0.3), 10, 200),
+    DistractorWorld("grid 20x20", lambda: grid(20), 0, 200),
+    DistractorWorld("grid 30x30", lambda: grid(30), 0, 200),
+    DistractorWorld("key and door 8x8, 8 lights", lambda: key_and_door(8), 8, 200),
+    DistractorWorld("14 lights", lambda: nothing(4), 14, 200),
 )
 """Worlds to measure exploration in; the bits are lights that flicker."""

@@ -25,7 +25,7 @@ LEAF_NOISE = 1.0
 
 
 @dataclass(frozen=True)
-class World:
+class RandomMDP:
     """A Markov decision process with S states, A actions and at most K successors of each (state, action).
 
     Attributes:
@@ -66,7 +66,7 @@ class World:
         return lost
 
 
-def random_world(kind: Kind, seed: int, n_states: int = N_STATES) -> World:
+def random_mdp(kind: Kind, seed: int, n_states: int = N_STATES) -> RandomMDP:
     """A world of random transitions.
 
     Args:
@@ -91,13 +91,13 @@ def random_world(kind: Kind, seed: int, n_states: int = N_STATES) -> World:
     q = optimal_q(successors, probabilities, rewards, ends, GAMMA)
     values = np.where(ends, 0.0, q.max(axis=1))
     noise = LEAF_NOISE * values[~ends].std() * rng.normal(size=n_states)
-    return World(successors, probabilities, rewards, ends, np.where(ends, 0.0, values + noise), q)
+    return RandomMDP(successors, probabilities, rewards, ends, np.where(ends, 0.0, values + noise), q)
 
 
-def side_by_side(worlds: Sequence[World]) -> World:
+def side_by_side(worlds: Sequence[RandomMDP]) -> RandomMDP:
     """Several worlds of equal K, A and gamma as one whose parts do not touch: state s of world w becomes w * S + s."""
     offsets = np.cumsum([0, *(len(world.rewards) for world in worlds[:-1])])
-    return World(
+    return RandomMDP(
         np.concatenate([world.successors + offset for world, offset in zip(worlds, offsets, strict=True)]),
         np.concatenate([world.probabilities for world in worlds]),
         np.concatenate([world.rewards for world in worlds]),
@@ -108,13 +108,13 @@ def side_by_side(worlds: Sequence[World]) -> World:
     )
 
 
-def choose_roots(world: World, n: int, seed: int) -> Ints:
+def choose_roots(world: RandomMDP, n: int, seed: int) -> Ints:
     """Distinct states int64 [n] to plan from, in which it matters what is done: not terminated, actions not all alike."""
     matters = np.flatnonzero(~world.ends & (np.ptp(world.q, axis=1) > 1e-9))
     return np.sort(np.random.default_rng(seed).permutation(matters)[:n]).astype(np.int64)
 
 
-def save_world(path: Path, world: World, **further: NDArray[np.generic]) -> None:
+def save_mdp(path: Path, world: RandomMDP, **further: NDArray[np.generic]) -> None:
     """Writes a world and further arrays as .npz, in the form that the scripts in ``scripts/peers`` read."""
     names = ("successors", "probabilities", "rewards", "ends", "leaf_values", "gamma")
     arrays = {name: np.asarray(getattr(world, name)) for name in names}

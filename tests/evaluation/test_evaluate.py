@@ -10,11 +10,11 @@ from mbagent.evaluation.evaluate import (
     random_policy,
 )
 from mbagent_envs.game import Game
-from worlds.games import find_case, game_of, play
+from worlds.games import find_case, play
 
 
 def runner(case: str = "geyser_low_cost") -> Game:
-    game = game_of(find_case(case))
+    game = find_case(case).game
     assert game is not None
     return game
 

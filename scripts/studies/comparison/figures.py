@@ -17,7 +17,7 @@ from mbagent.evaluation.report import FIGURE_STYLE, to_png
 from mbagent_envs.references import reference_policy
 from studies.comparison.records import AGENT, LEARNED_REWARD, RANDOM, TRUE_MODEL
 from studies.comparison.summary import CaseResult
-from worlds.games import Case, game_of
+from worlds.games import Case
 
 COLOURS = {
     AGENT: "#0b6e4f",
@@ -108,7 +108,7 @@ def _draw_case_curves(axes: Axes, result: CaseResult) -> None:
 def draw_game(case: Case, steps: int = 25, seed: int = 3) -> bytes:
     """A picture of a case after the reference player has played for some steps."""
     env = case.make_env(render_mode="rgb_array")
-    game = game_of(case)
+    game = case.game
     policy = None if game is None else reference_policy(game)
     env.action_space.seed(seed)
     obs, _ = env.reset(seed=seed)

@@ -28,7 +28,8 @@ from studies.comparison.records import (
     Record,
     hash_weights,
 )
-from worlds.games import Case, find_case, game_of, goals_of, measure_scale, play
+from worlds.games import Case, find_case, goals_of, play
+from worlds.known_rules import scale_of
 
 Report = Callable[[float], None]
 
@@ -149,7 +150,7 @@ def _play_fixed(job: Job, case: Case, policy: Policy) -> list[Record]:
 
 def _measure_scale(job: Job, case: Case, goal: str) -> Record:
     """The reference's mean return, with that of random play beside it."""
-    scale = measure_scale(case, goal, job.episodes)
+    scale = scale_of(case.world, goal, job.episodes)
     return _record(job, goal, np.array([scale.reference]), extra={"random": scale.random})
 
 
@@ -165,7 +166,7 @@ def _typical_observations(case: Case, n: int = 24) -> NDArray[Any]:
 
 
 def _plan_on_true_model(job: Job, case: Case, report: Report | None) -> list[Record]:
-    game = game_of(case)
+    game = case.game
     if game is None:
         return []
     agent = ModelLearningAgent("MctsPolicy", case.make_env(), model=SimulatorModel(game), seed=job.seed)
@@ -214,7 +215,7 @@ def _reward_warnings_ignored() -> Iterator[None]:
 
 def _score_goals(job: Job, case: Case, agent: ModelLearningAgent, seconds: float, report: Report | None) -> list[Record]:
     """Gives the agent one goal after the other and plays each."""
-    game = game_of(case)
+    game = case.game
     policy = as_policy(agent)
     learned = not isinstance(agent.model, SimulatorModel)
     records = []

@@ -43,7 +43,7 @@ def write_report(path: Path, results: Sequence[CaseResult], settings: Settings, 
         headline=_headline(results),
         baseline_settings={name: _words(options) for name, options in SETTINGS.items()},
         agents={"agent": AGENT, "learned_reward": LEARNED_REWARD},
-        arguments={result.case.key: _words(result.case.kwargs) for result in results},
+        arguments={result.case.key: _words(result.case.world.kwargs) for result in results},
     )
     files.write(path, page)
 

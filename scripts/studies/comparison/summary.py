@@ -13,7 +13,8 @@ from mbagent.evaluation.statistics import Interval, interquartile_interval, norm
 from studies.comparison.jobs import all_goals
 from studies.comparison.plan import BASELINES, Settings
 from studies.comparison.records import AGENT, LEARNED_REWARD, RANDOM, REFERENCE, TRUE_MODEL, Record, write_csv
-from worlds.games import Case, Scale, find_case
+from worlds.games import Case, find_case
+from worlds.known_rules import Scale
 
 
 @dataclass(frozen=True)

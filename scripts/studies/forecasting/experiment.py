@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-import gymnasium as gym
 import numpy as np
 import torch
 from stable_baselines3.common.env_util import make_vec_env
@@ -20,6 +19,7 @@ from mbagent.models.simulator import SimulatorModel
 from mbagent.spaces import ActionEnumeration, FactoredSpace
 from mbagent_envs.random_keys import derive
 from studies.forecasting import measures as m
+from worlds.registry import World, find_world
 
 Method = Literal["iterated", "direct", "true again"]
 """The one-step model iterated, models of n steps, and a second set of draws from the game: what chance alone gives."""
@@ -30,25 +30,8 @@ MOST_LISTED = 300
 """States up to which joint distributions are compared exactly."""
 
 
-@dataclass(frozen=True)
-class Case:
-    """A game and its arguments."""
-
-    name: str
-    env_id: str
-    arguments: tuple[tuple[str, Any], ...] = ()
-
-    def make(self) -> gym.Env[Any, Any]:
-        """The environment."""
-        return gym.make(self.env_id, **dict(self.arguments))
-
-
-CASES: tuple[Case, ...] = (
-    Case("GeyserRunner, stochastic", "mbagent/GeyserRunner-v0"),
-    Case("GeyserRunner, deterministic", "mbagent/GeyserRunner-v0", (("mode", "deterministic"),)),
-    Case("Maneuverer", "mbagent/Maneuverer-v0"),
-    Case("FlierCatcher", "mbagent/FlierCatcher-v0"),
-)
+CASES = tuple(map(find_world, ("GeyserRunner, stochastic", "GeyserRunner, deterministic", "Maneuverer", "FlierCatcher")))
+"""The games."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +105,7 @@ class Score:
 class Cell:
     """One game with one seed."""
 
-    case: Case
+    case: World
     seed: int
     settings: Settings
 

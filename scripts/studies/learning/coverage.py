@@ -18,8 +18,9 @@ from mbagent.agent import ModelLearningAgent
 from mbagent.evaluation.report import FIGURE_STYLE, to_png
 from mbagent.models.base import Actions, States, Successors, TransitionModel
 from mbagent.spaces import FactoredSpace
-from worlds.distractors import BesideWorld
-from worlds.environments import World, exact_world, true_model
+from worlds.distractors import DistractorWorld
+from worlds.known_rules import exact_world, true_model
+from worlds.registry import World
 
 MAX_PAIRS = 400
 """Model error is measured on so many reachable (state, action), drawn once."""
@@ -39,7 +40,7 @@ class Cell:
         marks: environment steps after which to measure, ascending; the model is fitted anew at each.
     """
 
-    world: World | BesideWorld
+    world: World | DistractorWorld
     exploration: str
     seed: int
     marks: tuple[int, ...]
@@ -88,7 +89,7 @@ def run_cell(cell: Cell) -> Result[Cell]:
         ValueError: the world's rules are not known.
     """
     agent = ModelLearningAgent("MctsPolicy", cell.world.make(), seed=cell.seed, exploration=cell.exploration)
-    figures = _beside(cell.world, agent) if isinstance(cell.world, BesideWorld) else _exactly(cell.world, agent)
+    figures = _with_distractors(cell.world, agent) if isinstance(cell.world, DistractorWorld) else _exactly(cell.world, agent)
     rows: list[Row] = []
     for mark in cell.marks:
         began = time.process_time()
@@ -125,7 +126,7 @@ def _exactly(world: World, agent: ModelLearningAgent) -> Callable[[], Row]:
     return figures
 
 
-def _beside(world: BesideWorld, agent: ModelLearningAgent) -> Callable[[], Row]:
+def _with_distractors(world: DistractorWorld, agent: ModelLearningAgent) -> Callable[[], Row]:
     """What measures an agent in a world that was made up."""
     pairs = _pairs(world.known.reachable(), agent.policy.actions.n)
     some = pairs[np.random.default_rng(0).permutation(len(pairs))[:MAX_PAIRS]]

@@ -19,7 +19,7 @@ from mbagent.agent import ModelLearningAgent
 from mbagent.evaluation.baselines import BaselineName, as_policy, train_baseline
 from mbagent.evaluation.evaluate import Policy, evaluate_env, random_policy
 from mbagent.evaluation.report import FIGURE_STYLE, to_png
-from worlds.environments import World, for_networks
+from worlds.registry import World, for_networks
 
 OURS, RANDOM = "mbagent", "random"
 PLAYERS = (OURS, "PPO", "DQN", RANDOM)

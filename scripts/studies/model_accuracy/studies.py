@@ -36,7 +36,8 @@ from mbagent.transitions import TransitionBatch, TransitionDataset
 from mbagent_envs import Game, Maneuverer
 from mbagent_envs.random_keys import derive
 from studies.model_accuracy.experiment import CASES, LEARNING_RATE, certain_factors, random_play
-from worlds.games import find_case, measure_scale
+from worlds.games import find_case
+from worlds.known_rules import scale_of
 from worlds.minatar import minatar, variants
 from worlds.nonstationary import CHANGES
 
@@ -253,7 +254,7 @@ def agents(seed: int, full: bool) -> list[Row]:
     ours, began = time.process_time() - began, time.process_time()
     PPO("MlpPolicy", gym.make("mbagent/Maneuverer-v0"), seed=seed, device="cpu").learn(100_000)
     seconds = {"20,000 steps, s": ours, "PPO 100,000 steps, s": time.process_time() - began}
-    scale = measure_scale(find_case("maneuverer"))
+    scale = scale_of(find_case("maneuverer").world)
     gap = (returns["learned"] - returns["true"]) / (scale.reference - scale.random)
     return [{"game": "Maneuverer", **returns, "learned - true, normalised": gap, **seconds}]
 

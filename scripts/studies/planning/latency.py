@@ -16,7 +16,8 @@ from harness import Row
 from mbagent.agent import ModelLearningAgent
 from mbagent.evaluation.baselines import as_policy
 from mbagent.evaluation.statistics import interquartile_mean, normalised
-from worlds.games import Scale, find_case, game_of, play
+from worlds.games import find_case, play
+from worlds.known_rules import Scale
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ def measure(setting: Setting, seed: int, scale: Scale, episodes: int) -> list[Ro
     Observations are those of new episodes, none twice; the first decisions, which compile, and what is done once for a goal are
     timed apart.
     """
-    case, game = find_case(setting.key), game_of(find_case(setting.key))
+    case, game = find_case(setting.key), find_case(setting.key).game
     assert game is not None
     env = case.make_env()
     learner = ModelLearningAgent("MctsPolicy", env, seed=seed).learn(LEARNED_FROM, log_interval=None)

@@ -14,7 +14,7 @@ from mbagent.planning.machine_search import known_machine, search_machine
 from mbagent.planning.mcts import MctsPlanner
 from mbagent.planning.planner import PlannerSettings, best_actions
 from studies.planning.peers import Speed
-from worlds.random_mdps import Ints, World
+from worlds.random_mdps import Ints, RandomMDP
 
 
 class TableSearch(Protocol):
@@ -25,11 +25,11 @@ class TableSearch(Protocol):
         ...
 
 
-Prepare: TypeAlias = Callable[[World], TableSearch]
+Prepare: TypeAlias = Callable[[RandomMDP], TableSearch]
 """What is done once for a world: the rules and the goal are given, and what a state is worth that was not looked beyond."""
 
 
-def as_model(world: World) -> TableModel:
+def as_model(world: RandomMDP) -> TableModel:
     """The world as a transition model of one factor."""
     n_states, n_actions, n_successors = world.successors.shape
     following, nowhere = np.ascontiguousarray(world.successors.reshape(-1)), np.zeros(0, dtype=np.int64)
@@ -37,7 +37,7 @@ def as_model(world: World) -> TableModel:
     return TableModel(offsets, following, world.ends[following], world.probabilities.reshape(-1), n_actions, nowhere)
 
 
-def with_rollouts(world: World) -> TableSearch:
+def with_rollouts(world: RandomMDP) -> TableSearch:
     """The agent's planner as textbook UCT. It values leaves by random play and cannot be given leaf values."""
     model, none = as_model(world), np.zeros((0, 1), dtype=np.int64)
 
@@ -53,7 +53,7 @@ def with_rollouts(world: World) -> TableSearch:
     return search
 
 
-def on_machine(world: World) -> TableSearch:
+def on_machine(world: RandomMDP) -> TableSearch:
     """Tree search on the world as a known machine."""
     model = as_model(world)
     following, over = model.next_states, model.terminated

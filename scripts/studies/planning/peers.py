@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from worlds.random_mdps import Ints, World, save_world
+from worlds.random_mdps import Ints, RandomMDP, save_mdp
 
 SCRIPTS = Path(__file__).parents[2] / "peers"
 """The scripts that run them, in the source tree."""
@@ -88,7 +88,7 @@ def run_script(python: Path, script: str, arguments: Sequence[str], timeout: flo
 def run_peer(
     python: Path,
     script: str,
-    world: World,
+    world: RandomMDP,
     roots: Ints,
     budgets: Sequence[int],
     seeds: Sequence[int],
@@ -113,7 +113,7 @@ def run_peer(
     most = SLOW.get(script, max(budgets, default=0))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "world.npz"
-        save_world(
+        save_mdp(
             path,
             world,
             roots=roots,

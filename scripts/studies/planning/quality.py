@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from exact import toy_text_mdp
@@ -17,18 +15,15 @@ from mbagent.evaluation.statistics import interquartile_interval, normalised
 from mbagent.models.base import Floats
 from mbagent.models.simulator import SimulatorModel
 from mbagent.models.table import toy_text_model
-from worlds.games import Scale, find_case, game_of, measure_scale, play
+from worlds.games import find_case, play
+from worlds.known_rules import Scale, scale_of
+from worlds.registry import find_world
 
 GAMES = ("geyser_deterministic", "geyser_low_cost", "geyser_high_cost", "flier_catcher", "maneuverer")
 """Cases that are games."""
 
-TOY_TEXT: dict[str, tuple[str, int, dict[str, Any]]] = {
-    "FrozenLake 4x4": ("FrozenLake-v1", 100, {"map_name": "4x4"}),
-    "FrozenLake 8x8": ("FrozenLake-v1", 100, {"map_name": "8x8"}),
-    "CliffWalking": ("CliffWalking-v1", 200, {}),
-    "Taxi": ("Taxi-v4", 200, {}),
-}
-"""Gymnasium's tables: id, steps of an episode, further arguments."""
+TOY_TEXT = {"FrozenLake 4x4": 100, "FrozenLake 8x8": 100, "CliffWalking": 200, "Taxi": 200}
+"""Gymnasium's tables, and the steps of an episode."""
 
 EPISODES, SCALE_EPISODES, STEPS = 20, 300, 50_000
 """Episodes of a seed; episodes that the scale is measured with; steps learned from."""
@@ -57,8 +52,7 @@ class Played:
 
 def play_table(name: str, seed: int) -> Played:
     """Plays a table with its true model; the value of what the agent does is computed exactly."""
-    env_id, limit, kwargs = TOY_TEXT[name]
-    env = gym.make(env_id, max_episode_steps=limit, **kwargs)
+    env = find_world(name).make(max_episode_steps=TOY_TEXT[name])
     model, reward = toy_text_model(env)
     agent = ModelLearningAgent("MctsPolicy", env, model=model, reward=reward, seed=seed)
     actions, _ = agent.predict(np.arange(model.cardinalities[0]))
@@ -69,7 +63,7 @@ def play_table(name: str, seed: int) -> Played:
 
 def play_game(key: str, seed: int, learned: bool, scale: Scale, episodes: int = EPISODES, steps: int = STEPS) -> Played:
     """Plays a game with its true model, or with one learned from ``steps`` steps, by the agent's default settings."""
-    case, game = find_case(key), game_of(find_case(key))
+    case, game = find_case(key), find_case(key).game
     assert game is not None
     if learned:
         agent = ModelLearningAgent("MctsPolicy", case.make_env(), seed=seed).learn(steps, log_interval=None)
@@ -85,7 +79,7 @@ def scales(say: Callable[[str], None]) -> dict[str, Scale]:
     found = {}
     for key in GAMES:
         say(f"scale of {key}")
-        found[key] = measure_scale(find_case(key), episodes=SCALE_EPISODES)
+        found[key] = scale_of(find_case(key).world, episodes=SCALE_EPISODES)
     return found
 
 

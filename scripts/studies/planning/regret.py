@@ -11,7 +11,7 @@ import numpy as np
 
 from studies.planning.ours import OWN_SEARCHES, Prepare, time_search
 from studies.planning.peers import PEERS, SPEEDS, PeerError, PeerResult, Speed, run_peer
-from worlds.random_mdps import N_STATES, Ints, Kind, World, choose_roots, random_world, side_by_side
+from worlds.random_mdps import N_STATES, Ints, Kind, RandomMDP, choose_roots, random_mdp, side_by_side
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Arena:
         n_worlds: W.
     """
 
-    world: World
+    world: RandomMDP
     roots: Ints
     n_worlds: int
 
@@ -87,7 +87,7 @@ class Arena:
 def build_arena(kind: Kind, settings: Settings) -> Arena:
     """The worlds of a kind."""
     seeds = range(settings.first_seed, settings.first_seed + settings.worlds)
-    worlds = [random_world(kind, seed) for seed in seeds]
+    worlds = [random_mdp(kind, seed) for seed in seeds]
     roots = [i * N_STATES + choose_roots(world, settings.roots, i) for i, world in enumerate(worlds)]
     if any(len(some) < settings.roots for some in roots):
         raise ValueError(f"There are fewer than {settings.roots} roots in some world; ask for fewer.")

@@ -17,7 +17,8 @@ from mbagent.models.pruning import PruningConfig
 from mbagent.spaces import ActionEnumeration, FactoredSpace
 from studies.pruning.measures import excess, marginal_error, measure_others, measure_speeds, unseen_play
 from studies.pruning.truth import agreement
-from worlds.games import Case, Scale, find_case, game_of, measure_scale, play
+from worlds.games import Case, find_case, play
+from worlds.known_rules import Scale, scale_of
 
 Networks: TypeAlias = Literal["causal", "paper"]
 """The default networks, or the paper's own: both on flat variables."""
@@ -62,7 +63,7 @@ class Settings:
     def __post_init__(self) -> None:
         """Checks the ranges."""
         for key in self.games:
-            if game_of(find_case(key)) is None:
+            if find_case(key).game is None:
                 raise ValueError(f"{key} is none of this package's games, which have exact rules to compare with.")
         if not self.fractions or not all(0.0 <= fraction < 1.0 for fraction in self.fractions):
             raise ValueError(f"Shares of connections to remove are numbers from 0 up to but not 1, got {list(self.fractions)}.")
@@ -166,8 +167,8 @@ def run_cell(cell: Cell) -> Result[Cell]:
     model = NeuralTransitionModel(space.cardinalities, n_actions, config)
     agent = mbagent.ModelLearningAgent("MctsPolicy", env, model=model, seed=cell.seed)
     agent.learn(settings.timesteps, log_interval=None)
-    learned, scale = agent.get_parameters(), measure_scale(case) if settings.episodes else Scale(0.0, 1.0)
-    game = game_of(case)
+    learned, scale = agent.get_parameters(), scale_of(case.world) if settings.episodes else Scale(0.0, 1.0)
+    game = case.game
     assert game is not None
     outcome = Outcome(cell, tuple(space.names), game.action_names)
     outcome.others.update(measure_others(model, *unseen_play(case, cell.seed)[:2], cell.seed))
@@ -185,7 +186,7 @@ def _measure(
     key: Key, case: Case, scale: Scale, agent: mbagent.ModelLearningAgent, model: NeuralTransitionModel, outcome: Outcome
 ) -> None:
     """Everything about one pruned agent, added to the outcome."""
-    cell, report, found, game = outcome.cell, agent.fit_report, influence(model, effective=True), game_of(case)
+    cell, report, found, game = outcome.cell, agent.fit_report, influence(model, effective=True), case.game
     assert game is not None
     outcome.returns[key] = _play(cell, case, scale, agent)
     states, actions, following = unseen_play(case, cell.seed)

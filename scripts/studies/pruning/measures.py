@@ -13,7 +13,7 @@ from mbagent.models.neural import NeuralTransitionModel, PrunedAs
 from mbagent.models.simulator import SimulatorModel
 from mbagent_envs.random_keys import derive
 from studies.planning.sampling import EVERYTHING, microseconds, using
-from worlds.games import Case, game_of
+from worlds.games import Case
 from worlds.synthetic_dbn import random_data, random_inputs, trained
 
 ROWS = 1024
@@ -104,7 +104,7 @@ def measure_size(d: int, seed: int, fraction: float = 0.9) -> SizeRow:
 
 def unseen_play(case: Case, seed: int, n: int = 2000) -> tuple[Any, Any, Any]:
     """States, actions and next states int64 of random play that no agent learns from."""
-    game, rng = game_of(case), np.random.default_rng([seed, 77])
+    game, rng = case.game, np.random.default_rng([seed, 77])
     assert game is not None
     obs, rows = game.initial(derive(seed, np.arange(n // 100), 7)), []
     for step in range(100):
@@ -118,7 +118,7 @@ def unseen_play(case: Case, seed: int, n: int = 2000) -> tuple[Any, Any, Any]:
 
 def excess(case: Case, model: NeuralTransitionModel, states: Any, actions: Any, following: Any) -> float:
     """Nats a transition that the model loses on the true distribution; nan where either has no exact probabilities."""
-    game, alive = game_of(case), np.zeros(len(states), dtype=np.bool_)
+    game, alive = case.game, np.zeros(len(states), dtype=np.bool_)
     assert game is not None
     try:
         ours = model.log_prob(states, actions, following, alive)
@@ -132,7 +132,7 @@ def excess(case: Case, model: NeuralTransitionModel, states: Any, actions: Any, 
 
 def marginal_error(case: Case, model: NeuralTransitionModel, states: Any, actions: Any, n_draws: int = 200) -> float:
     """Total variation of single variables between draws of the model and of the game, mean over inputs and variables."""
-    game = game_of(case)
+    game = case.game
     assert game is not None
     row = np.repeat(np.arange(len(states)), n_draws)
     means = []

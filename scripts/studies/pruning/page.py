@@ -16,7 +16,7 @@ from mbagent.evaluation.statistics import Interval, mean_interval
 from studies.pruning.experiment import Key, Outcome, Settings, Way
 from studies.pruning.measures import SizeRow
 from studies.pruning.picture import draw_modules
-from worlds.games import find_case, game_of
+from worlds.games import find_case
 
 CURVES: dict[str, str] = {
     "returned": "normalised return",
@@ -179,7 +179,7 @@ def section_of(outcomes: Sequence[Outcome]) -> tuple[Section, dict[str, bytes]]:
         pictures[f"paths_{number}"] = draw_paths(first, key, linked(first, shown))
         caption = captioned(key)
         cards.append(Card(caption[0].upper() + caption[1:], pictures[f"paths_{number}"]))
-    if (game := game_of(find_case(first.cell.game))) is not None:
+    if (game := find_case(first.cell.game).game) is not None:
         pictures["modules"] = draw_modules(first.linked[shown], game.observation_space.shape)
         cards.append(Card(f"Modules, {captioned(shown)}", pictures["modules"]))
     about = "Variables that lead to each other in a step, and what leads to them."

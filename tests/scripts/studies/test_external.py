@@ -11,7 +11,8 @@ import pytest
 from external_benchmark import Args, cells, main
 from harness import write_csv
 from studies.external import IMAGINED, OURS, TRUE, Cell, markdown_table, run_cell
-from worlds.environments import CONTINUOUS, WORLDS, World, find_world, for_networks, scale_of
+from worlds.known_rules import scale_of
+from worlds.registry import CONTINUOUS, WORLDS, World, find_world, for_networks
 
 LAKE = find_world("FrozenLake 4x4")
 
@@ -90,7 +91,7 @@ def test_the_command_writes_a_line_for_each_case(tmp_path: Path, capsys: pytest.
 @pytest.mark.parametrize("name", ["Navigation", "CrossingTraffic", "SkillTeaching"])
 def test_rddl_tables_are_the_domains_rules(name: str) -> None:
     from mbagent.adapters.rddl import RddlEnv  # noqa: PLC0415 - an optional dependency
-    from worlds.environments import exact_world, tables_of, true_model  # noqa: PLC0415
+    from worlds.known_rules import exact_world, tables_of, true_model  # noqa: PLC0415
 
     world = find_world(name)
     tables, env, rng = tables_of(world.target), RddlEnv(world.target), np.random.default_rng(0)

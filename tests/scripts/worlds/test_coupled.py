@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from mbagent_envs.random_keys import derive
-from worlds import coupled as crowds
-from worlds.coupled import WORLDS, World, cells, compare_values, corridor, play, ring
+from studies.planning import coupled as study
+from studies.planning.coupled import compare_values, play
+from worlds.coupled import COUPLED, CoupledWorld, cells, corridor, ring
 
 
-@pytest.mark.parametrize("make", WORLDS)
-def test_samples_and_successors_have_the_same_chances(make: Callable[[], World]) -> None:
+@pytest.mark.parametrize("make", COUPLED)
+def test_samples_and_successors_have_the_same_chances(make: Callable[[], CoupledWorld]) -> None:
     world = make()
     model, n = world.model, 4000
     states, actions = np.repeat(world.start[:1], n, axis=0), np.full(n, 1)
@@ -39,7 +40,7 @@ def test_what_the_worlds_do() -> None:
 
 
 def test_the_comparison_has_a_row_for_each_planner(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crowds, "STEPS", 2)
-    monkeypatch.setattr(crowds, "EPISODES", 2)
+    monkeypatch.setattr(study, "STEPS", 2)
+    monkeypatch.setattr(study, "EPISODES", 2)
     rows = compare_values(corridor(n_lights=2, cells=4), 0)
     assert [row["planner"] for row in rows] == ["random", "lookahead", "learned values"]

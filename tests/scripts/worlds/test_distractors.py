@@ -6,7 +6,7 @@ import pytest
 from exploration import main
 from mbagent.models import TabularModel
 from mbagent.transitions import TransitionBatch, TransitionDataset
-from worlds.distractors import BESIDES, BesideWorld, chain, grid, key_and_door
+from worlds.distractors import DISTRACTORS, DistractorWorld, chain, grid, key_and_door
 
 
 def test_cores_are_as_large_as_they_should_be() -> None:
@@ -18,7 +18,7 @@ def test_cores_are_as_large_as_they_should_be() -> None:
 
 
 def test_a_model_that_saw_everything_is_hardly_wrong_and_one_that_saw_nothing_is() -> None:
-    world = BesideWorld("two lights", lambda: chain(3), 2, 50)
+    world = DistractorWorld("two lights", lambda: chain(3), 2, 50)
     env, rng = world.make(), np.random.default_rng(0)
     obs, rows = env.reset(seed=0)[0], []
     for _ in range(6000):
@@ -38,7 +38,7 @@ def test_a_model_that_saw_everything_is_hardly_wrong_and_one_that_saw_nothing_is
 
 
 def test_the_script_knows_them(tmp_path: object, capsys: pytest.CaptureFixture[str]) -> None:
-    assert len({world.name for world in BESIDES}) == len(BESIDES)
+    assert len({world.name for world in DISTRACTORS}) == len(DISTRACTORS)
     options = ["--worlds", "14 lights", "--marks", "20", "--explorations", "random", "--workers", "1", "--output", str(tmp_path)]
     assert main(options) == 0
     assert "14 lights" in capsys.readouterr().out

@@ -1,10 +1,11 @@
 import pytest
 
-from worlds.games import find_case, goals_of, measure_scale
+from worlds.games import find_case, goals_of
+from worlds.known_rules import scale_of
 
 
 def test_scales_are_those_known_for_the_games() -> None:
-    scale = measure_scale(find_case("geyser_high_cost"), episodes=300)
+    scale = scale_of(find_case("geyser_high_cost").world, episodes=300)
     assert scale.random == pytest.approx(4.8, abs=1.5)
     assert scale.reference == pytest.approx(43.8, abs=0.5)
 

@@ -6,7 +6,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from exact import toy_text_mdp
-from worlds.environments import find_world
+from worlds.registry import find_world
 from worlds.toy_mdps import TableEnv, deep_sea, inventory
 
 

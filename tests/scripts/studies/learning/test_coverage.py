@@ -10,7 +10,8 @@ from exact import toy_text_mdp
 from exploration import main
 from mbagent.models import TabularModel
 from studies.learning.coverage import outcomes, reachable, wrongness
-from worlds.environments import exact_world, find_world, true_model
+from worlds.known_rules import exact_world, true_model
+from worlds.registry import find_world
 
 
 def test_reachable_states_are_those_in_which_play_goes_on() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from learning_curves import Args, cells, main
 from studies.learning.curves import OURS, RANDOM, Cell, run_cell
-from worlds.environments import find_world
+from worlds.registry import find_world
 
 CLIFF = find_world("CliffWalking")
 

@@ -9,12 +9,12 @@ from studies.planning.page import write_page
 from studies.planning.peers import PeerError, run_peer
 from studies.planning.regret import Settings, build_arena, compare, score
 from tests.worlds import optimal_q
-from worlds.random_mdps import Floats, Ints, Kind, World, choose_roots, random_world, side_by_side
+from worlds.random_mdps import Floats, Ints, Kind, RandomMDP, choose_roots, random_mdp, side_by_side
 
 
 @pytest.mark.parametrize("kind", get_args(Kind))
 def test_exact_values_are_those_of_value_iteration_written_another_way(kind: Kind) -> None:
-    world = random_world(kind, 3)
+    world = random_mdp(kind, 3)
     assert np.allclose(world.table.sum(axis=2), 1.0)
     ends = tuple(int(s) for s in np.flatnonzero(world.ends))
     assert np.allclose(world.q, optimal_q(world.table, world.rewards, world.gamma, ends), atol=1e-9)
@@ -27,7 +27,7 @@ def test_exact_values_are_those_of_value_iteration_written_another_way(kind: Kin
 
 
 def test_worlds_side_by_side_do_not_touch() -> None:
-    worlds = [random_world("dense", seed) for seed in (0, 1)]
+    worlds = [random_mdp("dense", seed) for seed in (0, 1)]
     both = side_by_side(worlds)
     assert np.array_equal(both.table[:25, :, :25], worlds[0].table)
     assert np.array_equal(both.table[25:, :, 25:], worlds[1].table)
@@ -45,7 +45,7 @@ def test_a_perfect_search_has_no_regret_and_random_choice_a_regret_of_one() -> N
 
 
 def test_the_planner_on_a_table_needs_no_luck_where_one_action_is_far_better() -> None:
-    world = random_world("dense", 0)
+    world = random_mdp("dense", 0)
     model = as_model(world)
     states, actions = np.full((4000, 1), 3), np.zeros(4000, dtype=np.int64)
     drawn, ended = model.sample(states, actions, np.random.default_rng(0))
@@ -58,7 +58,7 @@ def test_the_planner_on_a_table_needs_no_luck_where_one_action_is_far_better() -
         assert samples >= 4 * 512
 
 
-def greedy_in_leaf_values(world: World) -> TableSearch:
+def greedy_in_leaf_values(world: RandomMDP) -> TableSearch:
     def search(roots: Ints, n_simulations: int, seed: int) -> tuple[Ints, int]:
         worth: Floats = world.table[roots] @ (world.rewards + world.gamma * world.leaf_values)
         return worth.argmax(axis=1), 0
@@ -81,6 +81,6 @@ def test_without_peers_one_line_says_so_and_the_page_shows_the_rest(tmp_path: Pa
 
 
 def test_a_peer_that_does_not_run_is_an_error_that_says_why() -> None:
-    world = random_world("dense", 0)
+    world = random_mdp("dense", 0)
     with pytest.raises(PeerError, match="mctx_search"):
         run_peer(Path("no-such-python"), "mctx_search", world, np.array([0]), [16], [0])

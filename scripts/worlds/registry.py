@@ -1,4 +1,4 @@
-"""The environments that are not the agent's own and, where they are at hand, their true rules."""
+"""The environments of the studies, by name."""
 
 from __future__ import annotations
 
@@ -6,29 +6,18 @@ import importlib.util
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import DiscretizeObservation, TransformObservation
 
-from exact import FiniteHorizonMDP, toy_text_mdp
+import mbagent_envs  # noqa: F401 - registers
 from harness import find
 from mbagent.adapters.minatar import make_minatar
 from mbagent.adapters.minigrid import make_minigrid
 from mbagent.adapters.rddl import RddlEnv
-from mbagent.evaluation.evaluate import evaluate_env, random_policy
-from mbagent.models.base import TransitionModel
-from mbagent.models.table import toy_text_model
-from mbagent.rewards import RewardFn
-from worlds import toy_mdps as made  # noqa: F401 - registers
-from worlds.games import Scale
-from worlds.rddl import RddlModel, RddlTables, rddl_tables
-from worlds.snapshots import SnapshotModel
-
-RANDOM_EPISODES = 300
-"""Episodes that random play is measured with, where it is not computed."""
+from worlds import toy_mdps  # noqa: F401 - registers
 
 
 @dataclass(frozen=True)
@@ -37,8 +26,8 @@ class World:
 
     Attributes:
         name: what the results call it.
-        kind: which package it is from, or is like; "binned" for continuous ones, cut into bins, "planes" for tables of which
-            planes are seen.
+        kind: which package it is from, or is like; "game" for this repository's, "binned" for continuous ones, cut into bins,
+            "planes" for tables of which planes are seen.
         target: id for ``gym.make``, or name of an RDDL domain or of a game.
         kwargs: further arguments.
         steps: environment steps for learning.
@@ -48,7 +37,7 @@ class World:
     """
 
     name: str
-    kind: Literal["toy_text", "rddl", "minigrid", "binned", "minatar", "planes"]
+    kind: Literal["game", "toy_text", "rddl", "minigrid", "binned", "minatar", "planes"]
     target: str
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     steps: int = 20_000
@@ -62,17 +51,18 @@ class World:
         needed = {"rddl": ("pyRDDLGym", "rddlrepository"), "minigrid": ("minigrid",), "minatar": ("minatar",)}.get(self.kind, ())
         return self.kind if any(importlib.util.find_spec(name) is None for name in needed) else None
 
-    def make(self) -> gym.Env[Any, Any]:
-        """A new copy."""
+    def make(self, **more: Any) -> gym.Env[Any, Any]:
+        """A new copy, with further arguments, which take the place of its own."""
+        kwargs = {**self.kwargs, **more}
         if self.kind == "rddl":
-            return RddlEnv(self.target, **self.kwargs)
+            return RddlEnv(self.target, **kwargs)
         if self.kind == "minigrid":
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DeprecationWarning)
-                return make_minigrid(self.target, **self.kwargs)
+                return make_minigrid(self.target, **kwargs)
         if self.kind == "minatar":
-            return make_minatar(self.target, **self.kwargs)
-        env = gym.make(self.target, **self.kwargs)
+            return make_minatar(self.target, **kwargs)
+        env = gym.make(self.target, **kwargs)
         env = clipped(env, self.bounds) if self.bounds else env
         return DiscretizeObservation(env, self.bins, multidiscrete=True) if self.bins else env
 
@@ -98,6 +88,18 @@ WORLDS = (
 )
 """The development set; the agent's defaults are the same for all."""
 
+_GEYSER = "mbagent/GeyserRunner-v0"
+
+GAMES = (
+    World("GeyserRunner, stochastic", "game", _GEYSER),
+    World("GeyserRunner, deterministic", "game", _GEYSER, {"mode": "deterministic"}),
+    World("GeyserRunner, stochastic, hit cost 1", "game", _GEYSER, {"mode": "stochastic", "hit_cost": 1.0}),
+    World("GeyserRunner, stochastic, hit cost 5", "game", _GEYSER, {"mode": "stochastic", "hit_cost": 5.0}),
+    World("Maneuverer", "game", "mbagent/Maneuverer-v0"),
+    World("FlierCatcher", "game", "mbagent/FlierCatcher-v0"),
+)
+"""This repository's games, with the arguments that the studies use."""
+
 
 CONTINUOUS = (
     World("CartPole, binned", "binned", "CartPole-v1", bins=(3, 3, 8, 8), bounds=(2.4, 3.0, 0.21, 3.0)),
@@ -113,60 +115,17 @@ ARCADE = (
 """Games of scripts/learning_curves.py, with sticky actions and ever more difficult; a history of one step."""
 
 
+REGISTRY = {world.name: world for world in (*WORLDS, *CONTINUOUS, *ARCADE, *GAMES)}
+"""Every environment of the studies, by its name."""
+
+
 def find_world(name: str) -> World:
     """The world called ``name``.
 
     Raises:
         ValueError: there is none; the message lists those there are.
     """
-    return find("world", name, {world.name: world for world in (*WORLDS, *CONTINUOUS, *ARCADE)})
-
-
-@cache
-def tables_of(target: str) -> RddlTables:
-    """The tables of an RDDL domain's first instance."""
-    return rddl_tables(RddlEnv(target))
-
-
-def exact_world(world: World) -> FiniteHorizonMDP | None:
-    """A world as tables; None where its rules are not at hand."""
-    if world.kind in ("toy_text", "planes"):
-        return toy_text_mdp(world.make())
-    return _exact_rddl(world.target) if world.kind == "rddl" else None
-
-
-@cache
-def _exact_rddl(target: str) -> FiniteHorizonMDP:
-    return tables_of(target).mdp(RddlEnv(target).rddl.horizon)
-
-
-def true_model(world: World) -> tuple[TransitionModel, RewardFn] | None:
-    """A world's rules and reward, as the planner takes them; None where they are not at hand."""
-    if world.kind == "toy_text":
-        return toy_text_model(world.make())
-    if world.kind == "rddl":
-        model = RddlModel(tables_of(world.target))
-        return model, model.reward
-    if world.kind == "minigrid":
-        tried = _snapshots(world.name)
-        return tried, tried.reward
-    return None
-
-
-@cache
-def _snapshots(name: str) -> SnapshotModel:
-    return SnapshotModel(find_world(name).make())
-
-
-def scale_of(world: World) -> Scale:
-    """Returns of random play and of the best: exact where rules are known; else random play is measured, the best not known."""
-    known = exact_world(world)
-    if known is not None:
-        return Scale(known.random_return(), known.optimal_return())
-    space = world.make().action_space
-    assert isinstance(space, gym.spaces.Discrete)
-    chance = random_policy(int(space.n), seed=1)
-    return Scale(float(evaluate_env(world.make, chance, episodes=RANDOM_EPISODES, seed=1).default.mean()), float("nan"))
+    return find("world", name, REGISTRY)
 
 
 def clipped(env: gym.Env[Any, Any], bounds: tuple[float, ...]) -> gym.Env[Any, Any]:
