@@ -26,7 +26,6 @@ from studies.comparison.page import write_report
 from studies.comparison.plan import BASELINES, FULL, QUICK, Settings, load
 from studies.comparison.plan import run as run_comparison
 from studies.comparison.records import Record
-from studies.comparison.runner import JobsFailedError
 from studies.comparison.summary import save_csv, summarise
 from worlds.games import CASES, find_case
 
@@ -87,15 +86,13 @@ def prepare(args: Args, run: Run) -> Records:
     """The records of a new comparison, or of the last one in the folder.
 
     Raises:
-        ValueError: an option is out of range, there are no records, or jobs failed.
+        ValueError: an option is out of range, or there are no records.
+        CellsFailedError: jobs failed.
     """
     settings, start = settings_of(args), time.perf_counter()
     if args.report_only:
         return *load(args.output), 0.0
-    try:
-        records = run_comparison(settings, args.output, workers=args.workers, console=run.console, resume=args.resume)
-    except JobsFailedError as error:
-        raise ValueError(str(error)) from error
+    records = run_comparison(settings, args.output, workers=args.workers, console=run.console, resume=args.resume)
     return settings, records, (time.perf_counter() - start) / 60
 
 

@@ -6,11 +6,14 @@ as csv files and shows how far it is. ``run_command`` is the command line around
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import shlex
 import sys
+import threading
 import time
+import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,9 +21,12 @@ from typing import Any, Generic, Protocol, TypeAlias, TypeVar
 
 import tyro
 from joblib import Parallel, delayed
-from rich.console import Console
+from rich.console import Console, Group
+from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress_bar import ProgressBar
 from rich.table import Table
+from rich.text import Text
 
 from mbagent import files
 
@@ -33,6 +39,8 @@ Tables: TypeAlias = dict[str, list[Row]]
 Cell = TypeVar("Cell")
 Outcome = TypeVar("Outcome")
 Known = TypeVar("Known")
+
+_HEARTBEAT_SECONDS = 30.0
 
 
 class Options(Protocol):
@@ -129,7 +137,7 @@ def run_command(
         script: name of the file, without its ending.
         description: its docstring, whose first line ``--help`` shows.
         args_type: dataclass of the options.
-        prepare: what is to be done; raises ValueError where there is nothing, with a sentence for the user.
+        prepare: what is to be done; raises ValueError where there is nothing, with a sentence for the user, or CellsFailedError.
         execute: does it.
         argv: the options; None for those of this process.
         opens: whether the folder is emptied for the run: earlier results there move to a folder of their own inside it.
@@ -141,7 +149,7 @@ def run_command(
     try:
         check_run(run.folder, run.workers)
         plan = prepare(args, run)
-    except ValueError as error:
+    except (ValueError, CellsFailedError) as error:
         run.refuse(error)
         return 1
     if opens:
@@ -215,6 +223,177 @@ def run_all(
                 elapsed = "{:d}:{:02d}".format(*divmod(int(time.perf_counter() - start), 60))
                 console.print(f"{elapsed} {done} of {len(todo)}: {name(outcome)}", highlight=False, soft_wrap=True)
             yield outcome
+
+
+class CellsFailedError(RuntimeError):
+    """Some cells failed; what the others left is kept."""
+
+
+class Recorded(Protocol):
+    """A cell whose outcome is kept in a file of its own."""
+
+    @property
+    def name(self) -> str:
+        """What is shown of it."""
+        ...
+
+    @property
+    def file_name(self) -> str:
+        """The file in the folder of records."""
+        ...
+
+
+Job = TypeVar("Job", bound=Recorded)
+
+
+@dataclass(frozen=True)
+class Recorder(Generic[Job, Outcome]):
+    """How cells with records are run.
+
+    Attributes:
+        work: does a cell, and calls its second argument with the share done, 0 ... 1, now and then.
+        write: keeps the outcomes of a cell, all or nothing.
+        read: reads what ``write`` wrote.
+        shown: what is shown of outcomes.
+    """
+
+    work: Callable[[Job, Callable[[float], None]], list[Outcome]]
+    write: Callable[[Path, Sequence[Outcome]], None]
+    read: Callable[[Path], list[Outcome]]
+    shown: Callable[[Sequence[Outcome]], str]
+
+
+@dataclass(frozen=True)
+class _Done(Generic[Job, Outcome]):
+    job: Job
+    outcomes: list[Outcome]
+    seconds: float
+    error: str = ""
+
+
+def run_recorded(
+    recorder: Recorder[Job, Outcome], jobs: Sequence[Job], folder: Path, *, workers: int, console: Console
+) -> list[Outcome]:
+    """Runs all cells that ``folder`` has no records of yet, and returns the outcomes of all.
+
+    Args:
+        recorder: how.
+        jobs: what to do, the longest first.
+        folder: where each cell's records go as soon as it is done.
+        workers: number of processes; 1 runs the cells in this one.
+        console: where progress is shown.
+
+    Raises:
+        CellsFailedError: cells raised; the others were finished first.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for stale in folder.glob("*.progress"):
+        stale.unlink()
+    outcomes = [found for job in jobs if (folder / job.file_name).exists() for found in recorder.read(folder / job.file_name)]
+    waiting = [job for job in jobs if not (folder / job.file_name).exists()]
+    failures: list[_Done[Job, Outcome]] = []
+    board = _Board(folder, len(jobs), len(jobs) - len(waiting))
+    with _shown(board, console):
+        run = Parallel(n_jobs=workers, return_as="generator_unordered")
+        for done in run(delayed(_record)(recorder, job, folder) for job in waiting):
+            board.done += 1
+            outcomes.extend(done.outcomes)
+            if done.error:
+                failures.append(done)
+                line = f"failed  {done.job.name}: {done.error.strip().splitlines()[-1]}"
+                console.print(line, style="red", highlight=False, markup=False, soft_wrap=True)
+            else:
+                line = f"[{board.done:>3}/{board.total}] {done.job.name}{recorder.shown(done.outcomes)} ({done.seconds:.0f} s)"
+                console.print(line, highlight=False, markup=False, soft_wrap=True)
+    if failures:
+        log = folder / "errors.log"
+        files.write(log, "\n".join(f"{failed.job.name}\n{failed.error}" for failed in failures))
+        reasons = "\n".join(f"  {failed.job.name}: {failed.error.strip().splitlines()[-1]}" for failed in failures)
+        raise CellsFailedError(f"{len(failures)} of {len(jobs)} jobs failed; tracebacks are in {log}.\n{reasons}")
+    return outcomes
+
+
+def _record(recorder: Recorder[Job, Outcome], job: Job, folder: Path) -> _Done[Job, Outcome]:
+    """Runs one cell in a worker process; its progress goes through a small file."""
+    path = folder / job.file_name
+    progress = path.with_suffix(".progress")
+    start = time.perf_counter()
+    progress.write_text(f"0 {job.name}", encoding="utf-8")
+    last = start
+
+    def report(share: float) -> None:
+        nonlocal last
+        now = time.perf_counter()
+        if now - last > 0.5:
+            last = now
+            progress.write_text(f"{share:.3f} {job.name}", encoding="utf-8")
+
+    try:
+        outcomes = recorder.work(job, report)
+        recorder.write(path, outcomes)
+    except Exception:
+        return _Done(job, [], time.perf_counter() - start, traceback.format_exc())
+    finally:
+        progress.unlink(missing_ok=True)
+    return _Done(job, outcomes, time.perf_counter() - start)
+
+
+class _Board:
+    """What is going on: a bar over all jobs and one for each running job."""
+
+    def __init__(self, folder: Path, total: int, done: int) -> None:
+        self.folder = folder
+        self.total = total
+        self.done = done
+        self.start = time.perf_counter()
+
+    def running(self) -> list[tuple[float, str]]:
+        """(share done, name) of each running job."""
+        found = []
+        for path in sorted(self.folder.glob("*.progress")):
+            with contextlib.suppress(OSError, ValueError):  # it may end, or be half written, just now
+                share, name = path.read_text(encoding="utf-8").split(" ", 1)
+                found.append((float(share), name))
+        return found
+
+    @property
+    def elapsed(self) -> str:
+        """Minutes and seconds since the start."""
+        return "{:d}:{:02d}".format(*divmod(int(time.perf_counter() - self.start), 60))
+
+    def render(self) -> Group:
+        """The board for a terminal."""
+        table = Table.grid(padding=(0, 1))
+        for share, name in self.running():
+            table.add_row("  ", ProgressBar(total=1.0, completed=share, width=24), f"{share:>4.0%}", name)
+        bar = ProgressBar(total=max(self.total, 1), completed=self.done, width=40)
+        head = Table.grid(padding=(0, 1))
+        head.add_row(bar, Text(f"{self.done} of {self.total} jobs, {self.elapsed} since the start"))
+        return Group(head, table)
+
+
+@contextlib.contextmanager
+def _shown(board: _Board, console: Console) -> Iterator[None]:
+    """Shows the board live in a terminal, or as a line now and then where there is none."""
+    if console.is_terminal:
+        with Live(get_renderable=board.render, console=console, refresh_per_second=2, transient=True):
+            yield
+        return
+    stop = threading.Event()
+
+    def beat() -> None:
+        while not stop.wait(_HEARTBEAT_SECONDS):
+            now = "; ".join(f"{name} {share:.0%}" for share, name in board.running())
+            line = f"... {board.elapsed}, {board.done} of {board.total} jobs done; {now}"
+            console.print(line, highlight=False, soft_wrap=True)
+
+    thread = threading.Thread(target=beat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
 
 
 def grouped(rows: Iterable[Row], keys: Sequence[str]) -> dict[tuple[Any, ...], list[Row]]:

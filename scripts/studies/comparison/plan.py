@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from harness import Recorder, check_at_least, run_recorded
 from mbagent import files
-from studies.comparison.jobs import Job, all_goals
+from studies.comparison.jobs import Job, all_goals, run_job
 from studies.comparison.records import (
     AGENT,
     LEARNED_REWARD,
@@ -19,8 +21,8 @@ from studies.comparison.records import (
     TRUE_MODEL,
     Record,
     read_records,
+    write_records,
 )
-from studies.comparison.runner import run_jobs
 from worlds.games import CASES, Case, find_case
 
 BASELINES = ("PPO", "DQN", "A2C")
@@ -63,9 +65,7 @@ class Settings:
         Raises:
             ValueError: a setting is out of range.
         """
-        for name in ("steps", "seeds", "episodes", "goal_episodes", "scale_episodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        check_at_least(self, steps=1, seeds=1, episodes=1, goal_episodes=1, scale_episodes=1)
         if self.goal_seeds < 0 or any(multiple < 1 for multiple in self.baseline_multiples):
             raise ValueError("goal_seeds must not be negative, and baseline_multiples must be at least 1.")
         if not self.cases:
@@ -132,7 +132,7 @@ def run(settings: Settings, folder: Path, *, workers: int, console: Console, res
 
     Raises:
         ValueError: ``resume`` with other settings than those of the interrupted run, or no workers.
-        JobsFailedError: see ``run_jobs``.
+        CellsFailedError: see ``run_recorded``.
     """
     if workers < 1:
         raise ValueError(f"workers must be at least 1 process, got {workers}.")
@@ -145,7 +145,14 @@ def run(settings: Settings, folder: Path, *, workers: int, console: Console, res
             stale.unlink()
     kept.mkdir(parents=True, exist_ok=True)
     files.write(noted, text)
-    return run_jobs(plan_jobs(settings), kept, workers=workers, console=console)
+    recorder = Recorder(run_job, write_records, read_records, _mean)
+    return run_recorded(recorder, plan_jobs(settings), kept, workers=workers, console=console)
+
+
+def _mean(records: Sequence[Record]) -> str:
+    """What is shown of a job that is done."""
+    means = [record.mean for record in records if record.goal == "default"]
+    return f", mean return {means[0]:.2f}" if means else ""
 
 
 def load(folder: Path) -> tuple[Settings, list[Record]]:

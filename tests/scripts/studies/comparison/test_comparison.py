@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from harness import CellsFailedError, Recorder, run_recorded
 from mbagent.evaluation.report import format_interval, format_number
 from mbagent.evaluation.statistics import Interval
 from studies.comparison.jobs import Job, RewardOnly, run_job
@@ -25,7 +26,6 @@ from studies.comparison.records import (
     read_records,
     write_records,
 )
-from studies.comparison.runner import JobsFailedError, run_jobs
 from studies.comparison.summary import save_csv, summarise
 from worlds.games import find_case
 
@@ -97,7 +97,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path: Path, monkeypatch
         calls.append(job)
         return []
 
-    monkeypatch.setattr("studies.comparison.runner.run_job", noted)
+    monkeypatch.setattr("studies.comparison.plan.run_job", noted)
     (tmp_path / "records" / plan_jobs(settings)[0].file_name).unlink()
     run(settings, tmp_path, workers=1, console=quiet(), resume=True)
     assert calls == plan_jobs(settings)[:1]
@@ -116,9 +116,9 @@ def test_a_failing_job_is_named_and_the_others_are_kept(tmp_path: Path, monkeypa
             raise ZeroDivisionError("too small")
         return run_job(job, report)
 
-    monkeypatch.setattr("studies.comparison.runner.run_job", sometimes)
-    with pytest.raises(JobsFailedError, match=r"1 of 2 jobs failed(.|\n)*seed 1: ZeroDivisionError: too small"):
-        run_jobs([bad, good], tmp_path, workers=1, console=quiet())
+    recorder = Recorder(sometimes, write_records, read_records, lambda records: "")
+    with pytest.raises(CellsFailedError, match=r"1 of 2 jobs failed(.|\n)*seed 1: ZeroDivisionError: too small"):
+        run_recorded(recorder, [bad, good], tmp_path, workers=1, console=quiet())
     assert (tmp_path / good.file_name).exists()
     assert "Traceback" in (tmp_path / "errors.log").read_text(encoding="utf-8")
     assert not list(tmp_path.glob("*.progress"))
