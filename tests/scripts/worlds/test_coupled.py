@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from mbagent_envs.random_keys import derive
-from studies.planning import coupled as study
-from studies.planning.coupled import compare_values, play
+from studies.planning.coupled import play
 from worlds.coupled import COUPLED, CoupledWorld, cells, corridor, ring
 
 
@@ -37,10 +36,3 @@ def test_what_the_worlds_do() -> None:
     line = np.array([[0, 0, 0, 1, 1, 1, 0, 0, 0]])  # turns by a right angle
     on = life.model.marginals(line, np.array([0])).reshape(9, 2)[:, 1]
     np.testing.assert_allclose(on, np.where([0, 1, 0, 0, 1, 0, 0, 1, 0], 0.9, 0.1))
-
-
-def test_the_comparison_has_a_row_for_each_planner(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(study, "STEPS", 2)
-    monkeypatch.setattr(study, "EPISODES", 2)
-    rows = compare_values(corridor(n_lights=2, cells=4), 0)
-    assert [row["planner"] for row in rows] == ["random", "lookahead", "learned values"]
