@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 import math
 import platform
 import re
@@ -16,25 +15,9 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
-from matplotlib.figure import Figure
 
 from mbagent import files
 from mbagent.evaluation.statistics import Interval
-
-FIGURE_STYLE: Any = {
-    "font.size": 9.5,
-    "font.family": "DejaVu Sans",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": "#b8bfc8",
-    "axes.labelcolor": "#4a5361",
-    "axes.titlesize": 10.5,
-    "axes.titleweight": "bold",
-    "xtick.color": "#4a5361",
-    "ytick.color": "#4a5361",
-    "svg.hashsalt": "mbagent",
-}
-"""Settings for ``matplotlib.rc_context``: every figure of every page looks alike."""
 
 _TEMPLATES = Path(__file__).parent / "templates"
 _SHOWN_VERSIONS = ("gymnasium", "stable-baselines3", "torch", "numpy", "numba")
@@ -167,10 +150,3 @@ def format_interval(interval: Interval, digits: int = 2) -> str:
 def embedded(png: bytes) -> str:
     """A picture as a data address, so that the page needs no other file."""
     return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
-
-
-def to_png(figure: Figure) -> bytes:
-    """A figure as the bytes of a PNG file."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=140, bbox_inches="tight", facecolor="white")
-    return buffer.getvalue()

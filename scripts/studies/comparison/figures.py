@@ -10,10 +10,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 
-from mbagent.evaluation.report import FIGURE_STYLE, to_png
+from mbagent.evaluation.figures import FIGURE_STYLE, Line, Panel, draw_panels, to_png
 from mbagent_envs.references import reference_policy
 from studies.comparison.records import AGENT, LEARNED_REWARD, RANDOM, TRUE_MODEL
 from studies.comparison.summary import CaseResult
@@ -74,35 +73,16 @@ def _lines_of_the_scale(axes: Axes) -> None:
 
 def draw_curves(results: Sequence[CaseResult]) -> bytes:
     """Normalised return against environment steps for each case; bands reach from worst to best seed."""
-    columns = min(3, max(len(results), 1))
-    rows = -(-len(results) // columns)
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(3.6 * columns, 2.7 * rows), layout="constrained")
-        grid = figure.subplots(rows, columns, squeeze=False)
-        for axes in grid.flat[len(results) :]:
-            axes.set_visible(False)
-        for axes, result in zip(grid.flat, results, strict=False):
-            _draw_case_curves(axes, result)
-        for axes in grid[:, 0]:
-            axes.set_ylabel("normalised return")
-        drawn = [name for name in COLOURS if any(name == agent for r in results for agent, _ in r.curves)]
-        handles = [mpl.lines.Line2D([], [], color=COLOURS[name], label=name, linewidth=2) for name in drawn]
-        figure.legend(handles=handles, loc="outside upper center", ncols=3, frameon=False)
-        return to_png(figure)
-
-
-def _draw_case_curves(axes: Axes, result: CaseResult) -> None:
-    _lines_of_the_scale(axes)
-    for agent, points in result.curves:
-        steps, mean, low, high = (np.array(column) for column in zip(*points, strict=True))
-        model_based = agent in (AGENT, LEARNED_REWARD)
-        marker = "o" if model_based else None
-        axes.plot(steps, mean, color=colour_of(agent), linewidth=1.8, marker=marker, markersize=4, zorder=3)
-        axes.fill_between(steps, low, high, color=colour_of(agent), alpha=0.15, linewidth=0)
-    axes.set_title(result.case.title, loc="left")
-    axes.set_ylim(-0.2, 1.12)
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value / 1000:g}k"))
-    axes.set_xlabel("environment steps")
+    panels = []
+    for number, result in enumerate(results):
+        lines = [Line((), [0.0], "#b8bfc8"), Line((), [1.0], "#b8bfc8", style="--")]
+        for agent, points in sorted(result.curves, key=lambda curve: list(COLOURS).index(curve[0])):
+            steps, mean, low, high = zip(*points, strict=True)
+            thousands, marker = [n / 1000 for n in steps], "o" if agent in (AGENT, LEARNED_REWARD) else ""
+            lines.append(Line(thousands, mean, colour_of(agent), agent, band=(low, high), marker=marker))
+        y_label = "" if number % 3 else "normalised return"
+        panels.append(Panel(result.case.title, lines, "environment steps, thousands", y_label, y_limits=(-0.2, 1.12)))
+    return draw_panels(panels, size=(3.6, 2.7), columns=3)
 
 
 def draw_game(case: Case, steps: int = 25, seed: int = 3) -> bytes:

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from harness import Row, Tables
-from mbagent.evaluation.report import FIGURE_STYLE, Card, Page, Section, format_interval, format_number, to_png
+from mbagent.evaluation.figures import Line as Curve
+from mbagent.evaluation.figures import Panel, draw_panels
+from mbagent.evaluation.report import Card, Page, Section, format_interval, format_number
 from mbagent.evaluation.report import Table as TextTable
 from mbagent.evaluation.statistics import Interval, mean_interval
 from studies.forecasting.experiment import CASES, Method, Settings
@@ -136,34 +135,15 @@ def _card(table: Table, settings: Settings) -> Card:
 
 def draw_errors(found: Sequence[Table]) -> bytes:
     """Error against the number of steps, one panel a game."""
-    columns = min(2, len(found))
-    lines = -(-len(found) // columns)
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(4.8 * columns, 3.2 * lines), layout="constrained")
-        grid = figure.subplots(lines, columns, squeeze=False)
-        for axes in grid.flat[len(found) :]:
-            axes.set_visible(False)
-        for axes, table in zip(grid.flat, found, strict=False):
-            _draw_panel(axes, table)
-        handles, labels = grid.flat[0].get_legend_handles_labels()
-        for axes in grid.flat[: len(found)]:
-            more = axes.get_legend_handles_labels()
-            if len(more[0]) > len(handles):
-                handles, labels = more
-        figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
-        return to_png(figure)
+    return draw_panels([_panel(table) for table in found], size=(4.8, 3.2), columns=2)
 
 
-def _draw_panel(axes: Axes, table: Table) -> None:
-    steps = [line.n for line in table.lines]
+def _panel(table: Table) -> Panel:
+    steps, lines = [line.n for line in table.lines], []
     for method, (label, colour, marker) in _LOOKS.items():
         if method == "true again" and table.measure != "marginal":
             continue  # zero by definition
         cells = [line.errors[method] for line in table.lines]
-        axes.plot(steps, [c.estimate for c in cells], color=colour, marker=marker or None, markersize=4, label=label)
-        low, high = [max(c.low, 0.0) for c in cells], [min(c.high, 1.0) for c in cells]  # every measure is a share
-        axes.fill_between(steps, low, high, color=colour, alpha=0.15, linewidth=0)
-    axes.set_title(table.name, loc="left")
-    axes.set_ylabel(MEASURES[table.measure], fontsize=8)
-    axes.set_xlabel("steps ahead n")
-    axes.set_ylim(bottom=0.0)
+        band = [max(c.low, 0.0) for c in cells], [min(c.high, 1.0) for c in cells]  # every measure is a share
+        lines.append(Curve(steps, [c.estimate for c in cells], colour, label, band=band, marker=marker))
+    return Panel(table.name, lines, "steps ahead n", MEASURES[table.measure], y_limits=(0.0, None))

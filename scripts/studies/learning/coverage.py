@@ -7,15 +7,13 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from exact import FiniteHorizonMDP
 from harness import Result, Row, Run, grouped
 from mbagent.agent import ModelLearningAgent
-from mbagent.evaluation.report import FIGURE_STYLE, to_png
+from mbagent.evaluation.figures import Line, Panel, draw_panels
 from mbagent.models.base import Actions, States, Successors, TransitionModel
 from mbagent.spaces import FactoredSpace
 from worlds.distractors import DistractorWorld
@@ -155,23 +153,14 @@ def show(rows: Sequence[Row], run: Run) -> None:
 
 def draw_coverage(rows: Sequence[Row]) -> bytes:
     """A column for each world: share of pairs tried, and model error, against steps; a line for each seed. A PNG."""
-    worlds = list(dict.fromkeys(row["world"] for row in rows))
-    kinds = list(dict.fromkeys(row["exploration"] for row in rows))
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(2.6 * len(worlds) + 1.0, 5.2), layout="constrained")
-        grid = figure.subplots(2, len(worlds), squeeze=False, sharex="col")
-        for column, world in enumerate(worlds):
-            for axes, name in zip(grid[:, column], ("tried", "error"), strict=True):
-                for line in sorted({(row["exploration"], row["seed"]) for row in rows if row["world"] == world}):
-                    own = [row for row in rows if (row["world"], row["exploration"], row["seed"]) == (world, *line)]
-                    colour = f"C{kinds.index(line[0])}"
-                    axes.plot([row["steps"] for row in own], [row[name] for row in own], color=colour, marker=".")
-                axes.set_xscale("log")
-                axes.set_ylim(0.0, None)
-            grid[0, column].set_title(world)
-            grid[1, column].set_xlabel("environment steps")
-        grid[0, 0].set_ylabel("share of (state, action) tried")
-        grid[1, 0].set_ylabel("model error (total variation)")
-        handles = [mpl.lines.Line2D([], [], color=f"C{i}", label=kind) for i, kind in enumerate(kinds)]
-        figure.legend(handles=handles, loc="outside lower center", ncols=len(kinds), frameon=False)
-        return to_png(figure)
+    worlds, kinds = grouped(rows, ("world",)), list(grouped(rows, ("exploration",)))
+    panels = []
+    for figure, label in (("tried", "share of (state, action) tried"), ("error", "model error (total variation)")):
+        for number, ((world,), mine) in enumerate(worlds.items()):
+            lines = [
+                Line([row["steps"] for row in own], [row[figure] for row in own], f"C{kinds.index((kind,))}", kind, marker=".")
+                for (kind, _), own in sorted(grouped(mine, ("exploration", "seed")).items())
+            ]
+            first, x_label = figure == "tried", "" if figure == "tried" else "environment steps"
+            panels.append(Panel(world if first else "", lines, x_label, "" if number else label, "log", y_limits=(0.0, None)))
+    return draw_panels(panels, size=(2.6, 2.5), columns=len(worlds), legend="below")

@@ -9,16 +9,14 @@ from dataclasses import dataclass
 from typing import cast
 
 import gymnasium as gym
-import matplotlib as mpl
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 
 from harness import Result, Row, Run, grouped
 from mbagent.agent import ModelLearningAgent
 from mbagent.evaluation.baselines import BaselineName, as_policy, train_baseline
 from mbagent.evaluation.evaluate import Policy, evaluate_env, random_policy
-from mbagent.evaluation.report import FIGURE_STYLE, to_png
+from mbagent.evaluation.figures import Line, Panel, draw_panels
 from worlds.registry import World, for_networks
 
 OURS, RANDOM = "mbagent", "random"
@@ -119,24 +117,16 @@ def show(rows: Sequence[Row], run: Run) -> None:
 
 def draw_curves(rows: Sequence[Row]) -> bytes:
     """A panel for each world: mean return against environment steps, a line for each agent and seed. A PNG."""
-    worlds = list(dict.fromkeys(row["world"] for row in rows))
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(3.4 * len(worlds) + 1.0, 3.2), layout="constrained")
-        for axes, world in zip(figure.subplots(1, len(worlds), squeeze=False)[0], worlds, strict=True):
-            for agent, seed in sorted({(row["agent"], row["seed"]) for row in rows if row["world"] == world}):
-                own = [row for row in rows if (row["world"], row["agent"], row["seed"]) == (world, agent, seed)]
-                own.sort(key=lambda row: int(row["steps"]))
-                colour = f"C{PLAYERS.index(agent)}"
-                if agent == RANDOM:
-                    axes.axhline(own[0]["return"], color=colour, linestyle=":")
-                else:
-                    steps, values, errors = ([row[name] for row in own] for name in ("steps", "return", "error"))
-                    axes.errorbar(steps, values, errors, color=colour, marker=".", capsize=2)
-            axes.set_title(world)
-            axes.set_xlabel("environment steps")
-            axes.set_xscale("log")
-        figure.axes[0].set_ylabel("return")
-        agents = [name for name in PLAYERS if any(row["agent"] == name for row in rows)]
-        handles = [mpl.lines.Line2D([], [], color=f"C{PLAYERS.index(name)}", label=name) for name in agents]
-        figure.legend(handles=handles, loc="outside lower center", ncols=len(agents), frameon=False)
-        return to_png(figure)
+    panels: list[Panel] = []
+    for (world,), mine in grouped(rows, ("world",)).items():
+        lines = []
+        for (agent, _), own in sorted(grouped(mine, ("agent", "seed")).items()):
+            own.sort(key=lambda row: int(row["steps"]))
+            steps, values, errors = ([row[name] for row in own] for name in ("steps", "return", "error"))
+            colour = f"C{PLAYERS.index(agent)}"
+            if agent == RANDOM:
+                lines.append(Line((), values, colour, agent, style=":"))
+            else:
+                lines.append(Line(steps, values, colour, agent, errors, marker="."))
+        panels.append(Panel(world, lines, "environment steps", "" if panels else "return", "log"))
+    return draw_panels(panels, size=(3.4, 2.9), legend="below")

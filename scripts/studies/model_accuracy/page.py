@@ -6,13 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullFormatter, ScalarFormatter
 
-from mbagent.evaluation.report import FIGURE_STYLE, Card, Page, Section, Table, format_number, to_png
+from mbagent.evaluation.figures import Line, Panel, draw_panels
+from mbagent.evaluation.report import Card, Page, Section, Table, format_number
 from studies.model_accuracy.studies import STUDIES
 
 Row: TypeAlias = Mapping[str, Any]
@@ -86,50 +83,38 @@ def _exponents(rows: Sequence[Row]) -> list[str]:
 
 def draw_changes(rows: Sequence[Row]) -> bytes:
     """Exactness against steps after a change, one panel a change."""
-    names = list(dict.fromkeys(row["change"] for row in rows))
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(3.6 * len(names), 3.0), layout="constrained")
-        for axes, name in zip(figure.subplots(1, len(names), squeeze=False).flat, names, strict=True):
-            mine = [row for row in rows if row["change"] == name]
-            for way, colour in (("continued", "#00798c"), ("from scratch", "#d1495b")):
-                axes.plot([row["steps after it"] for row in mine], [row[way] for row in mine], "o-", color=colour, label=way)
-            axes.set_title(name, loc="left")
-            axes.set_xlabel("steps after the change")
-            axes.set_ylim(0.0, 1.03)
-        axes.legend(frameon=False, loc="lower right")
-        return to_png(figure)
+    panels = []
+    for name in dict.fromkeys(row["change"] for row in rows):
+        mine = [row for row in rows if row["change"] == name]
+        lines = [
+            Line([row["steps after it"] for row in mine], [row[way] for row in mine], colour, way)
+            for way, colour in (("continued", "#00798c"), ("from scratch", "#d1495b"))
+        ]
+        panels.append(Panel(name, lines, "steps after the change", y_limits=(0.0, 1.03)))
+    return draw_panels(panels)
 
 
 def draw_cost(rows: Sequence[Row]) -> bytes:
     """Times against d, both on logarithmic scales."""
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(7.2, 3.0), layout="constrained")
-        for axes, name in zip(figure.subplots(1, 2), ("fit seconds", "sample microseconds"), strict=True):
-            d, times = (np.array([row[key] for row in rows], dtype=np.float64) for key in ("d", name))
-            axes.loglog(d, times, "o-", color="#00798c")
-            axes.loglog(d, times[0] * (d / d[0]) ** 1.2, "--", color="#9aa3ad", label="d to the power of 1.2")
-            axes.xaxis.set_major_locator(FixedLocator(list(d)))
-            axes.xaxis.set_major_formatter(ScalarFormatter())
-            axes.xaxis.set_minor_formatter(NullFormatter())
-            axes.set_title(f"{name}: exponent {slope(rows, name):.2f}", loc="left")
-            axes.set_xlabel("variables d")
-            axes.legend(frameon=False)
-        return to_png(figure)
+    d, panels = [row["d"] for row in rows], []
+    for name in ("fit seconds", "sample microseconds"):
+        times = [row[name] for row in rows]
+        power = [times[0] * (n / d[0]) ** 1.2 for n in d]
+        lines = [Line(d, times, "#00798c"), Line(d, power, "#9aa3ad", "d to the power of 1.2", marker="", style="--")]
+        title, ticks = f"{name}: exponent {slope(rows, name):.2f}", {n: f"{n:g}" for n in d}
+        panels.append(Panel(title, lines, "variables d", x_scale="log", y_scale="log", x_ticks=ticks))
+    return draw_panels(panels)
 
 
 def draw_trust(rows: Sequence[Row]) -> bytes:
     """How often predictions were wrong against the estimate of it."""
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(4.4, 3.6), layout="constrained")
-        axes: Axes = figure.subplots()
-        for name in dict.fromkeys(row["world"] for row in rows):
-            mine = sorted((row["estimate"], row["rate"]) for row in rows if row["world"] == name and row["bin"] != "all")
-            axes.plot(*zip(*mine, strict=True), "o-", label=name, markersize=4)
-        axes.plot([0, 1], [0, 1], "--", color="#9aa3ad")
-        axes.set_xlabel("estimated probability of a wrong prediction")
-        axes.set_ylabel("share that was wrong")
-        axes.legend(frameon=False, fontsize=8)
-        return to_png(figure)
+    lines = [Line([0, 1], [0, 1], "#9aa3ad", marker="", style="--")]
+    for number, name in enumerate(dict.fromkeys(row["world"] for row in rows)):
+        mine = sorted((row["estimate"], row["rate"]) for row in rows if row["world"] == name and row["bin"] != "all")
+        estimates, rates = zip(*mine, strict=True)
+        lines.append(Line(estimates, rates, f"C{number}", name))
+    panel = Panel("", lines, "estimated probability of a wrong prediction", "share that was wrong")
+    return draw_panels([panel], size=(4.4, 3.6))
 
 
 _PICTURES = {"changes": draw_changes, "cost": draw_cost, "trust": draw_trust}

@@ -6,12 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import matplotlib as mpl
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, NullLocator, StrMethodFormatter
-
-from mbagent.evaluation.report import FIGURE_STYLE, Card, Page, Section, Table, format_number, to_png
+from mbagent.evaluation.figures import Line, Panel, draw_panels
+from mbagent.evaluation.report import Card, Page, Section, Table, format_number
 
 Row: TypeAlias = Mapping[str, Any]
 
@@ -77,29 +73,18 @@ def shown(value: Any) -> str:
 
 def draw_regret(rows: Sequence[Row]) -> bytes:
     """Regret against simulations for each search, a panel for each kind of world."""
-    kinds, searches = (list(dict.fromkeys(row[key] for row in rows)) for key in ("kind", "search"))
-    colours = {search: COLOURS[i % len(COLOURS)] for i, search in enumerate(searches)}
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(4.2 * len(kinds), 3.2), layout="constrained")
-        for axes, kind in zip(figure.subplots(1, len(kinds), squeeze=False).flat, kinds, strict=True):
-            for search in searches:
-                _draw_line(axes, [row for row in rows if (row["kind"], row["search"]) == (kind, search)], colours[search])
-            axes.set_title(f"{kind} rewards", loc="left")
-            axes.set_xscale("log", base=2)
-            axes.xaxis.set_major_locator(FixedLocator(sorted({row["simulations"] for row in rows})))
-            axes.xaxis.set_minor_locator(NullLocator())
-            axes.xaxis.set_major_formatter(StrMethodFormatter("{x:.0f}"))
-            axes.set_ylim(bottom=0.0)
-            axes.set_xlabel("simulations")
-        figure.axes[0].set_ylabel("regret (random action: 1)")
-        handles = [mpl.lines.Line2D([], [], color=colour, label=name, linewidth=2) for name, colour in colours.items()]
-        figure.legend(handles=handles, loc="outside upper center", ncols=3, frameon=False)
-        return to_png(figure)
-
-
-def _draw_line(axes: Axes, rows: Sequence[Row], colour: str) -> None:
-    x, y, error = ([row[name] for row in rows] for name in ("simulations", "regret", "error"))
-    axes.errorbar(x, y, yerr=error, fmt="o-", color=colour, markersize=4, linewidth=1.6, elinewidth=1.0)
+    searches = list(dict.fromkeys(row["search"] for row in rows))
+    ticks = {n: f"{n}" for n in sorted({row["simulations"] for row in rows})}
+    panels: list[Panel] = []
+    for kind in dict.fromkeys(row["kind"] for row in rows):
+        lines = []
+        for i, search in enumerate(searches):
+            own = [row for row in rows if (row["kind"], row["search"]) == (kind, search)]
+            x, y, error = ([row[name] for row in own] for name in ("simulations", "regret", "error"))
+            lines.append(Line(x, y, COLOURS[i % len(COLOURS)], search, error))
+        y_label = "" if panels else "regret (random action: 1)"
+        panels.append(Panel(f"{kind} rewards", lines, "simulations", y_label, "log2", y_limits=(0.0, None), x_ticks=ticks))
+    return draw_panels(panels, size=(4.2, 2.9))
 
 
 def write_page(path: Path, tables: Mapping[str, Sequence[Row]], command: str) -> dict[str, bytes]:

@@ -11,7 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mbagent.evaluation.report import FIGURE_STYLE, Card, Page, Section, Table, format_number, to_png
+from mbagent.evaluation.figures import FIGURE_STYLE, Line, Panel, draw_panels, to_png
+from mbagent.evaluation.report import Card, Page, Section, Table, format_number
 from mbagent.evaluation.statistics import Interval, mean_interval
 from studies.pruning.experiment import Key, Outcome, Settings, Way
 from studies.pruning.measures import SizeRow
@@ -210,19 +211,16 @@ def captioned(key: Key) -> str:
 def draw_curves(rows: Sequence[tuple[Key, Cells]]) -> bytes:
     """Everything against the pruned fraction, a line for each way."""
     fractions = sorted({key[0] for key, _ in rows})
-    with mpl.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(10, 4.8), layout="constrained")
-        for axes, (name, label) in zip(figure.subplots(2, 3).flat, CURVES.items(), strict=True):
-            for way in dict.fromkeys(key[1] for key, _ in rows):
-                mine = [(fractions.index(key[0]), cells[name]) for key, cells in rows if key[1] == way or not key[0]]
-                axes.plot(*zip(*mine, strict=True), color=COLOURS[way], marker="o", markersize=4, label=way)
-            axes.set_xticks(range(len(fractions)), [f"{fraction:.0%}" for fraction in fractions])
-            axes.set_title(label, loc="left")
-            if name in ("connections", "log_likelihood", "used") and min(cells[name] for _, cells in rows) > 0:
-                axes.set_yscale("log")
-            axes.set_xlabel("pruned")
-        figure.axes[0].legend(frameon=False)
-        return to_png(figure)
+    ticks: dict[float, str] = {i: f"{fraction:.0%}" for i, fraction in enumerate(fractions)}
+    panels = []
+    for name, label in CURVES.items():
+        lines = []
+        for way in dict.fromkeys(key[1] for key, _ in rows):
+            mine = [(fractions.index(key[0]), cells[name]) for key, cells in rows if key[1] == way or not key[0]]
+            lines.append(Line([x for x, _ in mine], [y for _, y in mine], COLOURS[way], way))
+        logarithmic = name in ("connections", "log_likelihood", "used") and min(cells[name] for _, cells in rows) > 0
+        panels.append(Panel(label, lines, "pruned", y_scale="log" if logarithmic else "linear", x_ticks=ticks))
+    return draw_panels(panels, size=(3.4, 2.4), columns=3)
 
 
 def draw_paths(outcome: Outcome, key: Key, variables: Sequence[int]) -> bytes:

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from mbagent.evaluation.report import FIGURE_STYLE, to_png
+from mbagent.evaluation.figures import FIGURE_STYLE, to_png
 from mbagent.models.modules import Influence, Module, dependent_groups, modules
 
 ALONE = "#eceff2"

@@ -10,7 +10,8 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from mbagent import files
-from mbagent.evaluation.report import FIGURE_STYLE, render, to_png
+from mbagent.evaluation.figures import FIGURE_STYLE, to_png
+from mbagent.evaluation.report import render
 from mbagent.evaluation.statistics import mean_interval
 from studies import TEMPLATES
 from studies.sampling_accuracy.experiment import Part, Settings

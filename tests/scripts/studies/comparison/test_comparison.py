@@ -11,8 +11,6 @@ import pytest
 from rich.console import Console
 
 from harness import CellsFailedError, Recorder, run_recorded
-from mbagent.evaluation.report import format_interval, format_number
-from mbagent.evaluation.statistics import Interval
 from studies.comparison.jobs import Job, RewardOnly, run_job
 from studies.comparison.page import write_report
 from studies.comparison.plan import FULL, QUICK, Settings, load, plan_jobs, run
@@ -157,10 +155,3 @@ def test_an_environment_without_its_reward_function_hides_it_everywhere() -> Non
     assert not hasattr(env.unwrapped, "game")
     env.reset(seed=0)
     assert env.step(2)[1] == pytest.approx(1 / 9)
-
-
-def test_numbers_are_written_for_readers() -> None:
-    assert format_number(-0.001) == "0.00"
-    assert format_number(-1234.5, 1) == "\N{MINUS SIGN}1,234.5"
-    assert format_number(float("nan")) == "–"
-    assert format_interval(Interval(0.5, 0.25, 0.75)) == "0.25 … 0.75"
