@@ -18,7 +18,7 @@ from mbagent.evaluation.evaluate import Policy
 
 BaselineName = Literal["PPO", "DQN", "A2C"]
 
-SETTINGS: Mapping[str, Mapping[str, Any]] = {
+BASELINE_SETTINGS: Mapping[str, Mapping[str, Any]] = {
     "PPO": {"n_envs": 8, "n_steps": 125, "batch_size": 250, "learning_rate": 1e-3, "ent_coef": 0.01},
     "DQN": {
         "n_envs": 8,
@@ -117,13 +117,13 @@ def train_baseline(
         seed: seed of networks, exploration and environments.
         evaluate: mean return of a policy (and whether it is deterministic), for the learning curve.
         points: evaluations on the learning curve, besides the one before training.
-        reward_scale: what rewards are multiplied with for training; None for what SETTINGS say.
+        reward_scale: what rewards are multiplied with for training; None for what BASELINE_SETTINGS say.
         report: told the share of steps done, 0 ... 1.
 
     Returns:
         (the trained algorithm, learning curve as (environment steps, mean return)).
     """
-    settings = dict(SETTINGS[name])
+    settings = dict(BASELINE_SETTINGS[name])
     usual = settings.pop("reward_scale", 1.0)
     scale = usual if reward_scale is None else reward_scale
 

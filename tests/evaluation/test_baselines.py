@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mbagent.evaluation.baselines import SETTINGS, BaselineName, as_policy, train_baseline
+from mbagent.evaluation.baselines import BASELINE_SETTINGS, BaselineName, as_policy, train_baseline
 from mbagent.evaluation.evaluate import Policy
 from worlds.games import find_case, play
 
@@ -29,5 +29,5 @@ def test_a_baseline_learns_an_easy_game_in_a_few_thousand_steps() -> None:
 
 
 def test_longer_runs_of_all_baselines_stay_exact_too() -> None:
-    for settings in SETTINGS.values():
+    for settings in BASELINE_SETTINGS.values():
         assert 10_000 % (settings["n_envs"] * settings.get("n_steps", 1)) == 0

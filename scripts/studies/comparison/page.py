@@ -9,7 +9,7 @@ from typing import Any
 from gymnasium.error import DependencyNotInstalled
 
 from mbagent import files
-from mbagent.evaluation.baselines import SETTINGS
+from mbagent.evaluation.baselines import BASELINE_SETTINGS
 from mbagent.evaluation.report import render
 from mbagent.evaluation.statistics import Interval
 from studies import TEMPLATES
@@ -41,7 +41,7 @@ def write_report(path: Path, results: Sequence[CaseResult], settings: Settings, 
         curves=draw_curves(results) if any(result.curves for result in results) else None,
         pictures={result.case.key: _picture(result.case) for result in results},
         headline=_headline(results),
-        baseline_settings={name: _words(options) for name, options in SETTINGS.items()},
+        baseline_settings={name: _words(options) for name, options in BASELINE_SETTINGS.items()},
         agents={"agent": AGENT, "learned_reward": LEARNED_REWARD},
         arguments={result.case.key: _words(result.case.world.kwargs) for result in results},
     )

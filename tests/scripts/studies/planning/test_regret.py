@@ -1,10 +1,10 @@
-from pathlib from mbagent.types import Floats, Ints
-import Path
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
 import pytest
 
+from mbagent.types import Floats, Ints
 from studies.planning.ours import OWN_SEARCHES, TableSearch, as_model
 from studies.planning.page import write_page
 from studies.planning.peers import PeerError, run_peer
