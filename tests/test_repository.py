@@ -87,9 +87,11 @@ def test_files_and_functions_stay_short(path: Path) -> None:
     ("folder", "forbidden"),
     [
         ("envs", ("mbagent",)),
-        ("mbagent/models", ("mbagent.planning", "mbagent.agent", "mbagent.analysis")),
-        ("mbagent/planning", ("mbagent.agent", "mbagent.analysis")),
-        ("mbagent/adapters", ("mbagent.models", "mbagent.planning", "mbagent.agent", "mbagent.analysis")),
+        ("mbagent", ("exact", "harness", "peers", "scripts", "studies", "worlds")),
+        ("mbagent/models", ("mbagent.planning", "mbagent.agent", "mbagent.evaluation")),
+        ("mbagent/planning", ("mbagent.agent", "mbagent.evaluation")),
+        ("mbagent/adapters", ("mbagent.models", "mbagent.planning", "mbagent.agent", "mbagent.evaluation")),
+        ("scripts/worlds", ("studies",)),
     ],
 )
 def test_data_flows_one_way(folder: str, forbidden: tuple[str, ...]) -> None:
