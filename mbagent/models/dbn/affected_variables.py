@@ -1,8 +1,8 @@
 """Decision graphs as few flat arrays, with an index of the variables that a state affects, so that search evaluates only these.
 
-In the all-zero state, each variable has a *usual* distribution for each action; mostly it keeps its value. In another state, only
-variables can differ from this that test a changed feature on their usual path, or whose own value differs. If few cells of a
-board are occupied, these are few, whatever its size.
+In the all-zero state, each variable has a *usual* distribution for each action; mostly it keeps its value. In another state, a
+variable can only differ from this if a feature that is tested on its usual path differs, or if its own value does. If few cells
+of a board are occupied, these variables are few, regardless of the size of the board.
 Shapes: A actions, U variables, F factors, R values of all factors, W words of 64 variables, M adjacency features, Q mutex groups.
 """
 

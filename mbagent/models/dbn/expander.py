@@ -2,7 +2,7 @@
 
 The outcomes are those of ``successors.successors``, at a cost that grows with the number of affected variables and not with that
 of all variables. The only variable with synchronic arcs is the end of the episode; features of the next state are evaluated only
-when its graph asks for them.
+when its graph tests them.
 Shapes: A actions, U variables, F factors, Q mutex groups, W words of 64 variables, D features.
 """
 

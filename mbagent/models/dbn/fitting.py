@@ -218,7 +218,7 @@ class Fitted:
 
 
 def for_planning(fitted: Fitted) -> Fitted:
-    """The graphs for planning, where negligible values without any observation are no outcomes, but all observed ones are."""
+    """The graphs for planning, where negligible values are possible outcomes only if they were observed."""
     noise = np.full(1, NEGLIGIBLE)
     usual, synchronic, reset = (graphs._replace(noise=noise) for graphs in (fitted.usual, fitted.synchronic, fitted.reset))
     return replace(fitted, usual=usual, synchronic=synchronic, reset=reset)
