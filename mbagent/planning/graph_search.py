@@ -189,7 +189,7 @@ def measure_spans(graph: GraphArrays, tables: Tables) -> None:
 
 @compiled
 def take_in(graph: GraphArrays, tables: Tables, gamma: float, leaves: Ints, n_before: int) -> None:
-    """Initialises the values of the expanded ``leaves`` and of the nodes from number ``n_before`` on, then sweeps their groups."""
+    """Initialises values of the expanded ``leaves`` and of the nodes from number ``n_before`` on, then sweeps their groups."""
     n, m = graph.sizes[0], graph.sizes[1]
     v, q, rewards, active = tables.v[:n], tables.q[:n], tables.rewards[:m], np.zeros(len(tables.frontier), dtype=np.bool_)
     for node in range(n_before, n):

@@ -1,7 +1,7 @@
-"""Planners: value iteration on the reachable MDP (paper section 2), and tree search beyond it (paper section 4.1).
+"""Planners: value iteration on the reachable MDP (paper section 2), and tree search if it is too large (paper section 4.1).
 
-Where the whole reachable MDP is small, it is solved once for each reward. Elsewhere a local MDP around each observation is
-solved, and Monte Carlo tree search goes on from its values.
+If the reachable MDP is small, it is solved once for each reward. Otherwise a lookahead around each observation is solved, and
+Monte Carlo tree search starts from its values.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from mbagent.types import Actions, Floats, Ints, Reward, States
 from mbagent_envs.random_keys import derive
 
 RACED: dict[str, Any] = {"time_budget": None, "reuse_tree": False}
-"""Settings while ways to look ahead are compared: the outcome must hang on neither the clock nor the order."""
+"""Settings during races between lookahead configurations, whose result must depend neither on time nor on earlier decisions."""
 
 ROOTS_AT_ONCE = 16
-"""Roots that are imagined around together; bounds the memory."""
+"""Number of roots that are expanded together; bounds the memory."""
 
 
 class Expanded(NamedTuple):
-    """What was imagined around R roots, and what follows from it.
+    """State graph and values around R roots.
 
     Attributes:
-        graph: root r lies in group r.
+        graph: root r is in group r.
         nodes: int64 [R], the roots.
         solution: values of the graph.
         visits: [R, A], simulations through the roots' actions.
-        scores: [R, A], what the choice goes by.
-        tried: [N, A], simulations through all nodes' actions where behaviour goes by them; None where by values.
+        scores: [R, A], by which actions are chosen.
+        tried: [N, A], simulations through all nodes' actions if the policy is chosen by them; None if by values.
     """
 
     graph: StateGraph
@@ -57,10 +57,10 @@ class Expanded(NamedTuple):
 
 
 class ValueIterationPlanner:
-    """Acts greedily on the values of the reachable machine.
+    """Acts greedily on the values of the reachable MDP.
 
-    Where the machine reachable from the start states has at most ``max_states`` states it is generated once for the
-    model and solved once for each goal. A root outside of it gets a lookahead machine of its own.
+    If at most ``max_states`` states are reachable from the start states, this MDP is generated once for the model and solved
+    once for each goal. For each root outside of it, a lookahead is expanded and solved.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
@@ -75,17 +75,17 @@ class ValueIterationPlanner:
         self._described = False
 
     def set_model(self, model: TransitionModel, start_states: States) -> None:
-        """See Planner. The machine is generated at the next ``plan``."""
+        """See Planner. The reachable MDP is generated at the next ``plan``."""
         self._model, self._start, self._mdp, self._expanded, self._config = model, start_states, None, None, None
 
     def set_goal(self, goal: Reward) -> None:
-        """See Planner. The machine stays, its values go."""
+        """See Planner. The reachable MDP is kept, its values are dropped."""
         if self._mdp is not None:
-            self._mdp.values = None  # before the goal changes: an interrupt must not leave values of another one
+            self._mdp.values = None  # before the goal changes, so that an interrupt cannot leave values of another goal
         self._goal, self._config, self._described = goal, None, False
 
     def share_config(self, other: ValueIterationPlanner) -> None:
-        """Takes over how another planner of the same model and goal looks ahead, if that has found out."""
+        """Copies the lookahead configuration of another planner of the same model and goal, if that has chosen one."""
         self._config = other._config
 
     def plan(self, roots: States) -> Plan:
@@ -110,7 +110,7 @@ class ValueIterationPlanner:
         return Plan(best_actions(scores), values, visits)
 
     def _warn_of_doubt(self, bounds: Floats | None, nodes: Ints, scores: Floats, values: Floats) -> None:
-        """Warns, once for each goal, where rare outcomes that have no part in a plan could change it."""
+        """Warns, once for each goal, if rare outcomes that were merged with others could change the choice of an action."""
         if self._described or bounds is None or not undecided(scores, values, bounds[nodes]).any():
             return
         self._described, settings = True, self.settings
@@ -122,7 +122,7 @@ class ValueIterationPlanner:
         )
 
     def trace(self, root: States) -> PlanTrace:
-        """What the plan from one root [1, F] rests on; see PlanTrace."""
+        """Trace of the plan from one root [1, F]; see PlanTrace."""
         mdp = self._solved_mdp()
         nodes = mdp.find(root)
         if nodes[0] < 0 or mdp.graph is None or mdp.values is None:
@@ -139,27 +139,27 @@ class ValueIterationPlanner:
         return PlanTrace(plan, found.graph, int(found.nodes[0]), solution.rewards, policy, solution.v, machine_states)
 
     def _expand(self, roots: States) -> Expanded:
-        """Imagines around each root [R, F]; here a lookahead machine, solved, without a search."""
+        """Expands and solves a lookahead around each root [R, F]; no search follows."""
         graph, solution, nodes = self._lookahead(roots)
         scores = break_ties(graph, solution.q, nodes, self.settings.gamma)
         return Expanded(graph, nodes, solution, np.zeros_like(scores), scores)
 
     def _empty_graph(self) -> StateGraph:
-        """A graph for the next roots; what the last one held is gone."""
+        """An empty graph for the next roots, which reuses the memory of the last one."""
         if self._expanded is None:
             self._expanded = StateGraph(self._known_model())
         self._expanded.clear()
         return self._expanded
 
     def _lookahead(self, roots: States) -> tuple[StateGraph, Values, Ints]:
-        """A machine around each root [R, F], solved; root r is in group r. Returns (graph, values, root nodes)."""
+        """A solved lookahead around each root [R, F]; root r is in group r. Returns (graph, values, root nodes)."""
         config, graph, settings = self._chosen_config(), self._empty_graph(), self.settings
         nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
         grow_lookahead(graph, nodes, config.states, config.samples, settings.horizon, settings.seed)
         return graph, solve(graph, self._known_goal(), settings.gamma, len(roots), config.leaf), nodes
 
     def _chosen_config(self) -> LookaheadConfig:
-        """How to look ahead under this goal: as the settings say, with learned values at the edge or instead, if any."""
+        """Lookahead configuration for this goal: that of the settings, or the winner of a race if values are learned."""
         if self._config is None:
             settings, start = self.settings, self._start
             usual = LookaheadConfig(LOWEST_KNOWN, settings.lookahead_states, settings.lookahead_samples)
@@ -169,7 +169,7 @@ class ValueIterationPlanner:
         return self._config
 
     def _race(self, usual: LookaheadConfig, task: Task) -> LookaheadConfig:
-        """Learns values for the goal, and finds out whether plans are best with them at the edge, without or only with them."""
+        """Learns leaf values for the goal; races the lookahead with them, the one without, and the values after one step."""
         settings = self.settings
         leaf, met = learn_values(task)
         if len(leaf.common) == 0:
@@ -183,7 +183,7 @@ class ValueIterationPlanner:
             self.settings = replace(settings, **RACED)
             configs = (usual._replace(leaf=leaf), usual, LookaheadConfig(leaf, 1, settings.n_samples))
             return best_config(replace(task, start=met), configs, act)
-        finally:  # should the goal fail now, it is tried again
+        finally:  # if the goal fails here, the next call races again
             self.settings, self._config = settings, None
 
     def _solved_mdp(self) -> SolvedMdp:
@@ -209,24 +209,23 @@ class ValueIterationPlanner:
 
 
 FINAL_SWEEPS = 100
-"""Sweeps of value iteration, at most, that settle the grown graph after the last simulation."""
+"""Maximum number of sweeps of value iteration on the graph after the last simulation."""
 
 LEAF_SAMPLES = 4
-"""Draws for each (state, action) of a node that the search adds."""
+"""Number of samples for each (state, action) of a node that the search expands."""
 
 MAX_SEARCHED = 100_000
-"""Nodes at which a search with a time budget ends before its time; bounds the memory."""
+"""Number of nodes at which a search ends before its time budget is used; bounds the memory."""
 
 _SEARCH_SALT, _CARRIED_SALT = 0x5EA6C4, 0xCA1212
 
 
 class MctsPlanner(ValueIterationPlanner):
-    """UCT on a graph of imagined states.
+    """UCT on a state graph.
 
-    With ``leaf_values="mdp"`` the search starts from the values of a lookahead machine around the root, each counting as
-    ``prior_visits`` visits, and goes on growing it where it looks promising; where the whole reachable machine is known and
-    solved there is nothing to search for.
-    With ``leaf_values="rollouts"`` it starts from nothing and values leaves by random play, as textbook UCT does.
+    With ``leaf_values="machine"`` the search starts from the values of a lookahead around the root, each of which counts as
+    ``prior_visits`` visits, and expands promising states further; if the reachable MDP is solved, there is no search.
+    With ``leaf_values="rollouts"`` it starts without values and evaluates leaves by random play, as textbook UCT does.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
@@ -235,7 +234,7 @@ class MctsPlanner(ValueIterationPlanner):
         self._last: _Search | None = None
         self._spare: StateGraph | None = None
         self.settling = 0.0
-        """Seconds that the last search with a time budget took to settle a node, after its simulations."""
+        """Seconds for each node that the final value iteration of the last search with a time budget took."""
 
     def set_model(self, model: TransitionModel, start_states: States) -> None:
         """See Planner."""
@@ -248,7 +247,7 @@ class MctsPlanner(ValueIterationPlanner):
         self._last = None
 
     def forget(self) -> None:
-        """Drops what was kept of the last decision (with ``reuse_tree``)."""
+        """Drops the search of the last decision (kept with ``reuse_tree``)."""
         self._last = None
 
     def plan(self, roots: States) -> Plan:
@@ -279,8 +278,8 @@ class MctsPlanner(ValueIterationPlanner):
         return found
 
     def _carried_on(self, roots: States) -> _Search | None:
-        """The last decision's search, from a new root on; None where it knows too little of it, or is too large."""
-        last, self._last = self._last, None  # should the goal fail now, nothing half done is kept
+        """The last decision's search, with a new root; None if it has too few states after that, or too many in all."""
+        last, self._last = self._last, None  # if the goal fails now, no incomplete search is kept
         if last is None or len(roots) != 1 or len(last.graph) > MAX_KEPT:
             return None
         root = int(last.graph.find(roots)[0])
@@ -294,7 +293,7 @@ class MctsPlanner(ValueIterationPlanner):
         return _Search(self, graph, tables, np.zeros(1, dtype=np.int64), last.decision + 1)
 
     def _bare_roots(self, roots: States) -> tuple[StateGraph, Values, Ints]:
-        """As ``_lookahead``: the roots with their successors, all worth nothing yet."""
+        """As ``_lookahead``, but only the roots are expanded, and all values are 0."""
         graph = self._empty_graph()
         nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
         graph.expand(nodes, self.settings.n_samples, self.settings.seed)
@@ -304,21 +303,21 @@ class MctsPlanner(ValueIterationPlanner):
 
 
 class _Search:
-    """One batch of searches, one for each root; the roots' parts of the graph do not touch."""
+    """Searches for a batch of roots, one for each; no edge connects the groups of different roots."""
 
     def __init__(self, planner: MctsPlanner, graph: StateGraph, tables: Tables, roots: Ints, decision: int = 0) -> None:
         self.planner, self.graph, self.tables, self.roots, self.decision = planner, graph, tables, roots, decision
         settings = self.settings = planner.settings
         rollouts = settings.leaf_values == "rollouts"
         prior = 0.0 if rollouts else settings.prior_visits
-        # What is carried on must not meet the very luck that it was made of.
+        # A reused tree must not see the random numbers that it was built with.
         key = derive(settings.seed, _CARRIED_SALT, decision)[0] if decision else _key(settings.seed, 0)
         self.rules = Rules(settings.gamma, settings.c_uct, prior, rollouts, settings.backup == "mean", key)
         if not (rollouts and decision):
             measure_spans(graph.arrays, roots, self.tables)
 
     def run(self, deadline: float | None = None) -> Expanded:
-        """Runs all simulations, or those that there is time for; ``deadline`` is a value of ``time.perf_counter``."""
+        """Runs all simulations, or as many as fit before ``deadline``, a value of ``time.perf_counter``."""
         if deadline is not None:
             return self._run_until(deadline)
         settings, done = self.settings, 0
@@ -333,7 +332,7 @@ class _Search:
         return self._result()
 
     def _run_until(self, deadline: float) -> Expanded:
-        """Runs waves, one at least, until another one and what comes after the last would not be done in time."""
+        """Runs at least one batch; further ones if they and the final value iteration should end before the deadline."""
         wave, done, now = self.settings.wave, 0, time.perf_counter()
         paths = empty_paths(len(self.roots), wave, self.settings.horizon)
         leaves = np.empty(2 * len(self.roots) * wave, dtype=np.int64)
@@ -357,7 +356,7 @@ class _Search:
         return Expanded(graph, roots, solution, visits, break_ties(graph, solution.q, roots, self.settings.gamma))
 
     def _run_batch(self, paths: Paths, leaves: Ints, done: int) -> None:
-        """A wave of simulations: one call of the model, one of the goal."""
+        """One batch of simulations: one call of the model and one of the goal."""
         graph, rules = self.graph, self.rules
         n, n_widened = begin_batch(graph.arrays, self.roots, self.tables, rules, done, paths, leaves)
         n_nodes, n_edges, first = len(graph), graph.n_edges, paths.leaves.size
@@ -370,7 +369,7 @@ class _Search:
         end_batch(graph.arrays, self.roots, self.tables, rules, n_nodes, leaves[:n], widened, paths, ends)
 
     def _make_room(self) -> None:
-        """Lengthens the tables to the graph's length."""
+        """Enlarges the tables to the size of the graph."""
         tables, n, m = self.tables, len(self.graph), self.graph.n_edges
         if len(tables.v) < n:
             v, q, visits, counted = (_longer(table, 2 * n) for table in tables[:4])
@@ -380,7 +379,7 @@ class _Search:
         self.tables = tables
 
     def _rollouts(self, paths: Paths, done: int) -> Floats:
-        """Value [R, W] of the node each simulation ended at, by random play."""
+        """Value [R, W] of the node at which each simulation ended, by random play."""
         values, settings = np.zeros(paths.ends.shape), self.settings
         alive = paths.ends >= 0
         simulation = np.broadcast_to(done + np.arange(paths.ends.shape[1]), paths.ends.shape)[alive]
@@ -402,7 +401,7 @@ def _first_tables(solution: Values, roots: Ints) -> Tables:
 
 @lru_cache(maxsize=4096)
 def _key(seed: int, wave: int) -> np.uint64:
-    """Key of the search's luck (0), and of what the wave after ``wave - 1`` simulations imagines."""
+    """Key of the search's random numbers (0), and of the expansions of the batch after ``wave - 1`` simulations."""
     key: np.uint64 = (derive(seed, _SEARCH_SALT) if wave == 0 else derive(seed, _SEARCH_SALT, wave))[0]
     return key
 
@@ -414,7 +413,7 @@ def _longer(table: NDArray[np.float64], size: int) -> Floats:
 
 
 def _unit(values: Floats) -> Floats:
-    """Values [R, A] brought to 0 ... 1 by row, for breaking ties."""
+    """Values [R, A], each row scaled to 0 ... 1, for breaking ties."""
     low, high = values.min(axis=1, keepdims=True), values.max(axis=1, keepdims=True)
     unit: Floats = (values - low) / np.maximum(high - low, 1e-12)
     return unit
