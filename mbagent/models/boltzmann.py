@@ -1,9 +1,9 @@
-"""A conditional restricted Boltzmann machine: the other family of joint samplers that the paper's discussion names.
+"""A conditional restricted Boltzmann machine, the other family of joint samplers that the paper's discussion mentions.
 
 P(y | x) is proportional to exp(y b + y A x) prod_h (1 + exp(c_h + W_h y + U_h x)), as in Mnih, Larochelle and Hinton 2011,
 "Conditional restricted Boltzmann machines for structured output prediction". x are the columns of state and action,
-y those of the next factors and ``terminated``; a factor with k > 2 values is a softmax unit of k columns. A yardstick:
-the agent's own models sample in one pass and know their probabilities exactly.
+y those of the next factors and ``terminated``; a factor with k > 2 values is a softmax unit of k columns. This model serves
+for comparison: the agent's own models sample in one pass and have exact probabilities.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mbagent.types import Actions, Bools, Floats, Randomness, States
 from mbagent_envs.random_keys import derive, uniforms
 
 ENUMERATED = 4096
-"""Joint outcomes up to which probabilities are exact, by listing them all."""
+"""Maximum number of joint outcomes for which probabilities are exact, by enumeration."""
 
 
 @dataclass(frozen=True)
@@ -38,14 +38,14 @@ class BoltzmannConfig:
 
     Attributes:
         hidden: hidden units.
-        learning_rate: Adam's largest, of a one-cycle schedule.
+        learning_rate: maximum of Adam's one-cycle schedule.
         epochs: passes over the distinct rows, within the bounds on steps.
-        min_steps: fewest gradient steps.
-        max_steps: most gradient steps.
+        min_steps: minimum number of gradient steps.
+        max_steps: maximum number of gradient steps.
         batch_size: rows of a gradient step.
-        contrast: Gibbs steps from an observation to the outcome it is contrasted with (CD-k).
-        burn_in: Gibbs steps, from a random outcome, before a draw.
-        exact: whether training lists all outcomes instead of contrasting, where there are at most ``ENUMERATED``.
+        contrast: Gibbs steps of contrastive divergence (k of CD-k).
+        burn_in: Gibbs steps from a random outcome before a sample.
+        exact: whether training uses the exact likelihood instead of contrastive divergence, for at most ``ENUMERATED`` outcomes.
     """
 
     hidden: int = 128
@@ -66,7 +66,7 @@ class ConditionalBoltzmannMachine(BaseTransitionModel):
         cardinalities: number of values of each state factor, length F.
         n_actions: number of enumerated actions A.
         config: see BoltzmannConfig.
-        seed: of the first weights; ``fit`` starts from its own seed's.
+        seed: of the initial weights; ``fit`` starts from those of its own seed.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class ConditionalBoltzmannMachine(BaseTransitionModel):
 
     @one_thread()
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
-        """See TransitionModel; fits anew, to all rows."""
+        """See TransitionModel; starts from new weights and uses all rows."""
         began, config, generator = time.perf_counter(), self.config, self._build(seed)
         rows = examples(data.rows())
         per_epoch = max(1, -(-len(rows) // config.batch_size))
@@ -118,7 +118,7 @@ class ConditionalBoltzmannMachine(BaseTransitionModel):
         return FitReport(n_train=len(data), n_validation=0, epochs=round(n_steps / per_epoch), seconds=seconds)
 
     def _loss(self, batch: Examples, every: Tensor | None, generator: torch.Generator) -> Tensor:
-        """Minus log-likelihood where all outcomes are listed; else what contrastive divergence descends."""
+        """Negative log-likelihood if all outcomes are enumerated (``every``); else the objective of contrastive divergence."""
         inputs = self.codec.inputs(batch.states, batch.actions)
         outcomes = self.codec.targets(batch.outcomes)
         if every is not None:
@@ -152,7 +152,7 @@ class ConditionalBoltzmannMachine(BaseTransitionModel):
         return self.codec.logits(hidden @ w["W"] + inputs @ w["A"].T + w["b"])
 
     def _goodness(self, inputs: Tensor, outcomes: Tensor) -> Tensor:
-        """Unnormalised log-probability [B, Y] of outcomes [Y, n_columns], or of each row's own [B, Y, n_columns]."""
+        """Unnormalised log-probability [B, Y] of outcomes [Y, n_columns], or of different ones for each row [B, Y, n_columns]."""
         w = self.weights
         linear = inputs @ w["A"].T + w["b"]
         drive = (outcomes @ w["W"].T) + (inputs @ w["U"].T + w["c"])[:, None]
@@ -178,7 +178,7 @@ class ConditionalBoltzmannMachine(BaseTransitionModel):
         return np.ascontiguousarray(result[:, :-1]), result[:, -1] == 1
 
     def marginals(self, states: States, actions: Actions, n_samples: int = 1000) -> Floats:
-        """See TransitionModel; exact where all outcomes can be listed, else from draws."""
+        """See TransitionModel; exact if all outcomes can be enumerated, else from samples."""
         offsets = np.concatenate([[0], np.cumsum(self.cardinalities)[:-1]])
         result = np.zeros((len(states), sum(self.cardinalities)))
         if self.n_outcomes <= ENUMERATED:
@@ -193,7 +193,11 @@ class ConditionalBoltzmannMachine(BaseTransitionModel):
         return result
 
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
-        """See TransitionModel; exact where all outcomes can be listed."""
+        """See TransitionModel; exact, for models whose outcomes can be enumerated.
+
+        Raises:
+            NotImplementedError: there are more than ``ENUMERATED`` outcomes.
+        """
         if self.n_outcomes > ENUMERATED:
             raise NotImplementedError(
                 f"A Boltzmann machine over {self.n_outcomes:.3g} joint outcomes has no exact probabilities; "
@@ -237,6 +241,6 @@ def _tensors(states: States, actions: Actions) -> tuple[Tensor, Tensor]:
 
 
 def _choose(logits: Tensor, noise: Floats) -> Tensor:
-    """The value [B, O] of each factor at luck [B, O] of its distribution function."""
+    """The value [B, O] of each factor: the inverse of its distribution function at the uniforms ``noise`` [B, O]."""
     cumulated = torch.softmax(logits, dim=2).cumsum(dim=2)
     return (torch.from_numpy(noise)[:, :, None] >= cumulated[:, :, :-1]).sum(dim=2)
