@@ -95,21 +95,21 @@ class _Changes:
         value: index of the current value of each row, int64 [N].
         cell: index of each row's cell, -1 if the factor did not change, int64 [N].
         start: index of the current value of each cell, int64 [C].
-        ways: current and next value of each cell, [C, 2].
+        pairs: current and next value of each cell, [C, 2].
     """
 
     value: Ints
     cell: Ints
     start: Ints
-    ways: Ints
+    pairs: Ints
 
 
 def thinned(before: Values, actions: Actions, after: Values, most: int = MOST_COUNTED_STEPS) -> tuple[Values, Actions, Values]:
     """At most ``most`` of the transitions, evenly spaced."""
     if len(actions) <= most:
         return before, actions, after
-    some = np.linspace(0, len(actions) - 1, most).astype(np.int64)
-    return before[some], actions[some], after[some]
+    rows = np.linspace(0, len(actions) - 1, most).astype(np.int64)
+    return before[rows], actions[rows], after[rows]
 
 
 def find_controllable(before: Values, actions: Actions, after: Values, n_actions: int) -> Controllable:
@@ -127,71 +127,71 @@ def find_controllable(before: Values, actions: Actions, after: Values, n_actions
     """
     before, actions, after = thinned(before, actions, after)
     changes = _all_changes(before, after)
-    enough = SURE_EVIDENCE + math.log(n_actions * max(1, sum(len(change.start) for change in changes.values())))
+    threshold = SURE_EVIDENCE + math.log(n_actions * max(1, sum(len(change.start) for change in changes.values())))
     directly, classes = np.zeros(before.shape[1], dtype=np.bool_), {}
-    contexts = _in_contexts(changes, before, actions, n_actions)
+    contexts = _dependent_in_contexts(changes, before, actions, n_actions)
     for factor, change in changes.items():
         n_values, moved = int(change.value.max()) + 1, change.cell >= 0
-        if (n_values + len(change.start)) * n_actions > MOST_TABLE_COUNTS or change.ways.max() > MOST_VALUE:
+        if (n_values + len(change.start)) * n_actions > MOST_TABLE_COUNTS or change.pairs.max() > MOST_VALUE:
             classes[factor] = {int(value): int(value) for value in np.unique(before[:, factor])}
             continue
         pairs = change.value * n_actions + actions
         of_value = np.bincount(pairs, minlength=n_values * n_actions).reshape(n_values, -1)
-        staying = np.bincount(pairs[~moved], minlength=n_values * n_actions).reshape(n_values, -1)
+        unchanged = np.bincount(pairs[~moved], minlength=n_values * n_actions).reshape(n_values, -1)
         of_cell = np.bincount(change.cell[moved] * n_actions + actions[moved], minlength=len(change.start) * n_actions)
         of_cell = of_cell.reshape(-1, n_actions)
         logs = _evidence(of_cell, of_value[change.start])
-        directly[factor] = _speaks(logs).max() > enough or contexts[factor].any()
+        directly[factor] = _factor_evidence(logs).max() > threshold or contexts[factor].any()
         # Compared with no change only, so that a change does not seem to depend on actions because another one does.
-        odds = _evidence(of_cell, of_cell + staying[change.start])
-        dependent = contexts[factor] | (odds.max(axis=1) > enough / (1 + directly[factor]))
+        odds = _evidence(of_cell, of_cell + unchanged[change.start])
+        dependent = contexts[factor] | (odds.max(axis=1) > threshold / (1 + directly[factor]))
         # Values that almost always change get 0: without rows of both kinds, the odds give no evidence.
-        times = np.where(staying.sum(axis=1)[change.start] < RARE_CHANGE, 0, of_cell.sum(axis=1))
-        classes[factor] = _classes(change.ways, times, dependent, before[:, factor], after[:, factor])
+        n_changes = np.where(unchanged.sum(axis=1)[change.start] < RARE_CHANGE, 0, of_cell.sum(axis=1))
+        classes[factor] = _classes(change.pairs, n_changes, dependent, before[:, factor], after[:, factor])
     return Controllable(directly, classes)
 
 
-def _in_contexts(changes: Mapping[int, _Changes], before: Values, actions: Actions, n_actions: int) -> dict[int, Bools]:
+def _dependent_in_contexts(changes: Mapping[int, _Changes], before: Values, actions: Actions, n_actions: int) -> dict[int, Bools]:
     """For each factor, which of its cells depend on the action given the value of another factor.
 
     A value that is reached from the left by one action and from the right by another does not depend on the action alone.
     """
     result, factors = {f: np.zeros(len(change.start), dtype=np.bool_) for f, change in changes.items()}, list(changes)
-    some = (
+    rows = (
         slice(None)
         if len(actions) <= MOST_COUNTED_STEPS // 2
         else np.linspace(0, len(actions) - 1, MOST_COUNTED_STEPS // 2).astype(np.int64)
     )
-    of_cells, kept = _columns([changes[f].cell[some] for f in factors], CELLS)
-    stays = [np.where(changes[f].cell[some] < 0, changes[f].value[some], -1) for f in factors]
-    of_values, kept_values = _columns(stays, CELLS)
+    of_cells, kept = _columns([changes[f].cell[rows] for f in factors], CELLS)
+    unchanged = [np.where(changes[f].cell[rows] < 0, changes[f].value[rows], -1) for f in factors]
+    of_values, kept_values = _columns(unchanged, CELLS)
     place = {(f, number): column for column, (f, number) in enumerate(kept_values.tolist())}
-    begun = np.array([place.get((f, int(changes[factors[f]].start[cell])), -1) for f, cell in kept.tolist()], dtype=np.int64)
-    of_cells, kept, begun = of_cells[:, begun >= 0], kept[begun >= 0], begun[begun >= 0]
-    most = min(CAUSES, MOST_TABLE_COUNTS // (n_actions * max(1, len(begun))))
-    causes, _ = _columns([np.unique(before[some, f], return_inverse=True)[1] for f in factors], most, even=True)
-    if not len(begun) or not causes.shape[1]:
+    origin = np.array([place.get((f, int(changes[factors[f]].start[cell])), -1) for f, cell in kept.tolist()], dtype=np.int64)
+    of_cells, kept, origin = of_cells[:, origin >= 0], kept[origin >= 0], origin[origin >= 0]
+    most = min(CAUSES, MOST_TABLE_COUNTS // (n_actions * max(1, len(origin))))
+    causes, _ = _columns([np.unique(before[rows, f], return_inverse=True)[1] for f in factors], most, even=True)
+    if not len(origin) or not causes.shape[1]:
         return result
-    chosen = [actions[some] == action for action in range(n_actions)]
+    chosen = [actions[rows] == action for action in range(n_actions)]
     k, n = (
         np.stack([np.rint(columns[own].T @ causes[own]) for own in chosen]).astype(np.int64) for columns in (of_cells, of_values)
     )
-    n = n[:, begun] + k
-    enough, all_k, all_n = SURE_EVIDENCE + math.log(k.size), k.sum(axis=0), n.sum(axis=0)
-    dependent = np.max([(_evidence(k[a], n[a], all_k, all_n)).max(axis=1) for a in range(n_actions)], axis=0) > enough
+    n = n[:, origin] + k
+    threshold, all_k, all_n = SURE_EVIDENCE + math.log(k.size), k.sum(axis=0), n.sum(axis=0)
+    dependent = np.max([(_evidence(k[a], n[a], all_k, all_n)).max(axis=1) for a in range(n_actions)], axis=0) > threshold
     for f, cell in kept[dependent].tolist():
         result[factors[f]][cell] = True
     return result
 
 
-def _classes(ways: Ints, times: Ints, dependent: Bools, *met: NDArray[Any]) -> dict[int, int]:
+def _classes(pairs: Ints, n_changes: Ints, dependent: Bools, *observed: NDArray[Any]) -> dict[int, int]:
     """The lowest value of each value's class; changes that depend on actions, or are too rare to tell, do not join classes."""
     both: dict[tuple[int, int], int] = {}
-    apart = {(min(pair), max(pair)) for pair in ways[dependent].tolist()}
-    for pair, n in zip(ways.tolist(), times.tolist(), strict=True):
+    apart = {(min(pair), max(pair)) for pair in pairs[dependent].tolist()}
+    for pair, n in zip(pairs.tolist(), n_changes.tolist(), strict=True):
         key = min(pair), max(pair)
         both[key] = both.get(key, 0) + n
-    lowest = {int(value): int(value) for value in np.unique(np.concatenate(met))}
+    lowest = {int(value): int(value) for value in np.unique(np.concatenate(observed))}
     for (low, high), n in sorted(both.items()):
         if n >= RARE_CHANGE and (low, high) not in apart:
             one, other = lowest[low], lowest[high]
@@ -214,16 +214,16 @@ def find_reached(found: Controllable, before: Values, actions: Actions, after: V
     of_values, kept_values = _columns([changes[f].value for f in rest], CELLS)
     of_cells, kept_cells = _columns([changes[f].cell for f in rest], CELLS)
     place = {(f, number): column for column, (f, number) in enumerate(kept_values.tolist())}
-    begun = np.array([place.get((f, int(changes[rest[f]].start[cell])), -1) for f, cell in kept_cells.tolist()])
-    of_cells, owner, begun = of_cells[:, begun >= 0], np.array(rest)[kept_cells[begun >= 0, 0]], begun[begun >= 0]
-    while new.any() and len(begun):
+    origin = np.array([place.get((f, int(changes[rest[f]].start[cell])), -1) for f, cell in kept_cells.tolist()])
+    of_cells, owner, origin = of_cells[:, origin >= 0], np.array(rest)[kept_cells[origin >= 0, 0]], origin[origin >= 0]
+    while new.any() and len(origin):
         causes, _ = _columns([np.unique(before[:, f], return_inverse=True)[1] for f in np.flatnonzero(new)], CAUSES)
         causes = np.column_stack([causes, np.ones(len(causes), dtype=np.float32)])  # the last column counts all rows
         n, k = (np.rint(columns.T @ causes).astype(np.int64) for columns in (of_values, of_cells))
-        logs = _evidence(k[:, :-1], n[begun, :-1], k[:, -1:], n[begun, -1:])
+        logs = _evidence(k[:, :-1], n[origin, :-1], k[:, -1:], n[origin, -1:])
         new = np.zeros_like(reached)
         for f in np.unique(owner):
-            new[f] = not reached[f] and _speaks(logs[owner == f]).max() > SURE_EVIDENCE + math.log(logs.size)
+            new[f] = not reached[f] and _factor_evidence(logs[owner == f]).max() > SURE_EVIDENCE + math.log(logs.size)
         reached |= new
     return reached
 
@@ -248,10 +248,12 @@ def _columns(numbers: list[Ints], most: int, even: bool = False) -> tuple[NDArra
     """
     found: list[tuple[int, int, int]] = []
     for i, row in enumerate(numbers):
-        times = np.bincount(row[row >= 0])
-        weight = np.minimum(times, len(row) - times) if even else times
-        met = np.flatnonzero(times)
-        found += [(-int(weight[number]), i, int(number)) for number in (met[1:] if even and len(met) == 2 else met)]
+        counts = np.bincount(row[row >= 0])
+        weight = np.minimum(counts, len(row) - counts) if even else counts
+        distinct = np.flatnonzero(counts)
+        found += [
+            (-int(weight[number]), i, int(number)) for number in (distinct[1:] if even and len(distinct) == 2 else distinct)
+        ]
     kept = np.array([entry[1:] for entry in sorted(found)[:most]], dtype=np.int64).reshape(-1, 2)
     columns = np.zeros((len(numbers[0]), len(kept) + 1), dtype=np.float32)  # the last one for numbers without indicator
     for i in np.unique(kept[:, 0]):
@@ -270,8 +272,8 @@ def _log_gammas() -> Floats:
     return np.stack([halves, wholes])
 
 
-def _chance(k: Ints, n: Ints) -> Floats:
-    """Log marginal likelihood of k changes among n rows, with Jeffreys' prior."""
+def _log_marginal(k: Ints, n: Ints) -> Floats:
+    """Log marginal likelihood of a sequence of n rows with k changes, by Jeffreys' prior."""
     halves, wholes = _log_gammas()
     result: Floats = halves[k] + halves[n - k] - wholes[n]
     return result
@@ -288,10 +290,10 @@ def _evidence(k: Ints, n: Ints, all_k: Ints | None = None, all_n: Ints | None = 
     """
     all_k = k.sum(axis=1, keepdims=True) if all_k is None else all_k
     all_n = n.sum(axis=1, keepdims=True) if all_n is None else all_n
-    return _chance(k, n) + _chance(all_k - k, all_n - n) - _chance(all_k, all_n)
+    return _log_marginal(k, n) + _log_marginal(all_k - k, all_n - n) - _log_marginal(all_k, all_n)
 
 
-def _speaks(logs: Floats) -> Floats:
+def _factor_evidence(logs: Floats) -> Floats:
     """Log evidence [G] that a factor depends on each condition, from that of its changes [C, G]: of one alone, or of a share."""
     together = np.logaddexp(math.log(1.0 - LEAST_SHARE), math.log(LEAST_SHARE) + logs).sum(axis=0)
     result: Floats = np.maximum(logs.max(axis=0), together)

@@ -154,29 +154,29 @@ class DirectedExploration:
         """See Watching."""
         began = self._ended if len(self._ended) == len(ended) else np.ones(len(ended), dtype=np.bool_)
         self._ended = np.array(ended, dtype=np.bool_)
-        self._take(_Steps(states, actions, next_states, self._ended, began))
+        self._add_steps(_Steps(states, actions, next_states, self._ended, began))
 
     def recall(self, rows: TransitionBatch) -> None:
         """Records transitions that it did not observe; all their episodes must have ended."""
         rows = rows.select(np.argsort(rows.episodes, kind="stable"))
         change = rows.episodes[1:] != rows.episodes[:-1]
-        self._take(_Steps(rows.before, rows.actions, rows.after, np.append(change, True), np.append(True, change)))
+        self._add_steps(_Steps(rows.before, rows.actions, rows.after, np.append(change, True), np.append(True, change)))
 
-    def _take(self, steps: _Steps) -> None:
+    def _add_steps(self, steps: _Steps) -> None:
         self.n_steps += len(steps.actions)
-        look = self.n_steps >= self._reconsider_at
+        due = self.n_steps >= self._reconsider_at
         if self._kept is not None:
             self._unkept.append(steps)
             self._n_unkept += len(steps.actions)
-            if look or self._n_unkept >= STEPS_TOGETHER:
+            if due or self._n_unkept >= STEPS_TOGETHER:
                 self._keep(self._kept)
         if self.table is not None:
             self._uncounted.append(steps)
             self._n_uncounted += len(steps.actions)
-            if look or self.directed or self._n_uncounted >= STEPS_TOGETHER:  # counting many steps at once is faster
+            if due or self.directed or self._n_uncounted >= STEPS_TOGETHER:  # counting many steps at once is faster
                 self._count(self.table, _joined(self._uncounted))
                 self._uncounted, self._n_uncounted = [], 0
-        if look:
+        if due:
             self._reconsider_at = 2 * self.n_steps
             self._reconsider()
 
@@ -213,12 +213,12 @@ class DirectedExploration:
         if _distinct(steps.states) <= self._most:
             view = None
         else:
-            met = steps.states, steps.actions, steps.next_states
-            found = find_controllable(*met, self._random.n_actions)
+            data = steps.states, steps.actions, steps.next_states
+            found = find_controllable(*data, self._random.n_actions)
             view = StateAbstraction(found, np.zeros_like(found.directly))
             if not found.directly.any() or _distinct(view(steps.states)) > self._most:
                 return
-            finer = StateAbstraction(found, find_reached(found, *met))
+            finer = StateAbstraction(found, find_reached(found, *data))
             view = finer if _distinct(finer(steps.states)) <= self._most else view
         if self.table is None or not (view.same_as(self.view) if view is not None else self.view is None):
             self.view, self.table = view, VisitTable(self._random.n_actions)

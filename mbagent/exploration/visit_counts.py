@@ -172,8 +172,7 @@ def _mean(table: VisitArrays, node: int, action: int) -> tuple[float, int]:
 
 @compiled
 def _improve(table: VisitArrays, work: int, at: int, upwards: bool) -> tuple[int, bool]:
-    """Updates values in alternating sweeps up and down the nodes, from node ``at`` on; returns where and in which direction
-    to continue."""
+    """Sweeps up and down over the nodes in turn, in place, from node ``at`` on; returns node and direction to continue with."""
     n = table.sizes[0]
     for _ in range(2 * n):
         if at == START_NODE:

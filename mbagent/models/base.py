@@ -98,7 +98,7 @@ class BaseTransitionModel(ABC):
             (mean [B, ...], variance [B, ...]), the unbiased sample moments.
         """
         if n_samples < 2:
-            raise ValueError(f"Moments need at least 2 draws a row to have a variance, got n_samples={n_samples}.")
+            raise ValueError(f"Moments need at least 2 draws for each row to have a variance, got n_samples={n_samples}.")
         rows = np.repeat(np.arange(len(states)), n_samples)
         keys = derive(seed, np.arange(len(rows)))
         next_states, _ = self.sample(states[rows], actions[rows], keys)

@@ -104,11 +104,11 @@ class ConditionalBoltzmannMachine(BaseTransitionModel):
         per_epoch = max(1, -(-len(rows) // config.batch_size))
         n_steps = int(min(max(config.epochs * per_epoch, config.min_steps), config.max_steps)) if len(rows) else 0
         optimizer = torch.optim.Adam(self.weights.parameters(), lr=config.learning_rate)
-        every = self._every_outcome() if config.exact and self.n_outcomes <= ENUMERATED else None
+        all_outcomes = self._all_outcomes() if config.exact and self.n_outcomes <= ENUMERATED else None
         for done, batch in enumerate(batches(rows, config.batch_size, n_steps, generator)):
             optimizer.param_groups[0]["lr"] = config.learning_rate * one_cycle(done / n_steps)
             optimizer.zero_grad(set_to_none=True)
-            self._loss(batch, every, generator).backward()  # type: ignore[no-untyped-call]
+            self._loss(batch, all_outcomes, generator).backward()  # type: ignore[no-untyped-call]
             optimizer.step()
             if progress is not None and done % 100 == 0:
                 progress(done / n_steps)
@@ -117,47 +117,47 @@ class ConditionalBoltzmannMachine(BaseTransitionModel):
         seconds = time.perf_counter() - began
         return FitReport(n_train=len(data), n_validation=0, epochs=round(n_steps / per_epoch), seconds=seconds)
 
-    def _loss(self, batch: Examples, every: Tensor | None, generator: torch.Generator) -> Tensor:
-        """Negative log-likelihood if all outcomes are enumerated (``every``); else the objective of contrastive divergence."""
+    def _loss(self, batch: Examples, all_outcomes: Tensor | None, generator: torch.Generator) -> Tensor:
+        """Negative log-likelihood if all outcomes are enumerated; else the objective of contrastive divergence."""
         inputs = self.codec.inputs(batch.states, batch.actions)
         outcomes = self.codec.targets(batch.outcomes)
-        if every is not None:
-            scores = self._goodness(inputs, every)
-            losses = torch.logsumexp(scores, dim=1) - self._goodness(inputs, outcomes[:, None])[:, 0]
+        if all_outcomes is not None:
+            scores = self._scores(inputs, all_outcomes)
+            losses = torch.logsumexp(scores, dim=1) - self._scores(inputs, outcomes[:, None])[:, 0]
             return (losses * batch.weights).mean()
         with torch.no_grad():
-            imagined = outcomes
+            negatives = outcomes
             for _ in range(self.config.contrast):
-                hidden = torch.bernoulli(torch.sigmoid(self._drive(inputs, imagined)), generator=generator)
+                hidden = torch.bernoulli(torch.sigmoid(self._hidden_inputs(inputs, negatives)), generator=generator)
                 probabilities = torch.softmax(self._logits(inputs, hidden), dim=2)
                 drawn = torch.multinomial(probabilities.flatten(0, 1), 1, generator=generator).view(len(inputs), -1)
-                imagined = self.codec.targets(drawn)
-        difference = self._goodness(inputs, imagined[:, None]) - self._goodness(inputs, outcomes[:, None])
+                negatives = self.codec.targets(drawn)
+        difference = self._scores(inputs, negatives[:, None]) - self._scores(inputs, outcomes[:, None])
         return (difference[:, 0] * batch.weights).mean()
 
-    def _every_outcome(self) -> Tensor:
+    def _all_outcomes(self) -> Tensor:
         """Columns [Y, n_columns] of all joint outcomes."""
-        every = list(itertools.product(*(range(k) for k in self.codec.outputs)))
-        return self.codec.targets(torch.tensor(every, dtype=torch.int64))
+        outcomes = list(itertools.product(*(range(k) for k in self.codec.outputs)))
+        return self.codec.targets(torch.tensor(outcomes, dtype=torch.int64))
 
-    def _drive(self, inputs: Tensor, outcomes: Tensor) -> Tensor:
+    def _hidden_inputs(self, inputs: Tensor, outcomes: Tensor) -> Tensor:
         """Inputs [B, H] of the hidden units."""
         w = self.weights
-        drive: Tensor = outcomes @ w["W"].T + inputs @ w["U"].T + w["c"]
-        return drive
+        hidden_inputs: Tensor = outcomes @ w["W"].T + inputs @ w["U"].T + w["c"]
+        return hidden_inputs
 
     def _logits(self, inputs: Tensor, hidden: Tensor) -> Tensor:
         """Logits [B, O, K] of the next factors given the hidden units [B, H]."""
         w = self.weights
         return self.codec.logits(hidden @ w["W"] + inputs @ w["A"].T + w["b"])
 
-    def _goodness(self, inputs: Tensor, outcomes: Tensor) -> Tensor:
+    def _scores(self, inputs: Tensor, outcomes: Tensor) -> Tensor:
         """Unnormalised log-probability [B, Y] of outcomes [Y, n_columns], or of different ones for each row [B, Y, n_columns]."""
         w = self.weights
         linear = inputs @ w["A"].T + w["b"]
-        drive = (outcomes @ w["W"].T) + (inputs @ w["U"].T + w["c"])[:, None]
-        goodness: Tensor = (outcomes * linear[:, None]).sum(dim=2) + functional.softplus(drive).sum(dim=2)
-        return goodness
+        hidden_inputs = (outcomes @ w["W"].T) + (inputs @ w["U"].T + w["c"])[:, None]
+        scores: Tensor = (outcomes * linear[:, None]).sum(dim=2) + functional.softplus(hidden_inputs).sum(dim=2)
+        return scores
 
     @one_thread()
     @torch.no_grad()
@@ -171,8 +171,8 @@ class ConditionalBoltzmannMachine(BaseTransitionModel):
         factors = _choose(logits, uniforms(keys, len(codec.outputs)))
         for step in range(self.config.burn_in):
             noise = uniforms(derive(keys, step), self.config.hidden + len(codec.outputs))
-            drive = codec.targets(factors).double() @ w["W"].T + to_hidden
-            hidden = (torch.from_numpy(noise[:, : self.config.hidden]) < torch.sigmoid(drive)).double()
+            hidden_inputs = codec.targets(factors).double() @ w["W"].T + to_hidden
+            hidden = (torch.from_numpy(noise[:, : self.config.hidden]) < torch.sigmoid(hidden_inputs)).double()
             factors = _choose(codec.logits(hidden @ w["W"] + from_inputs), noise[:, self.config.hidden :])
         result = factors.numpy()
         return np.ascontiguousarray(result[:, :-1]), result[:, -1] == 1
@@ -182,9 +182,9 @@ class ConditionalBoltzmannMachine(BaseTransitionModel):
         offsets = np.concatenate([[0], np.cumsum(self.cardinalities)[:-1]])
         result = np.zeros((len(states), sum(self.cardinalities)))
         if self.n_outcomes <= ENUMERATED:
-            every = np.array(list(itertools.product(*(range(k) for k in self.codec.outputs))))[:, :-1]
+            all_outcomes = np.array(list(itertools.product(*(range(k) for k in self.codec.outputs))))[:, :-1]
             probabilities = np.exp(self._log_probabilities(states, actions))
-            for outcome, mass in zip(every, probabilities.T, strict=True):
+            for outcome, mass in zip(all_outcomes, probabilities.T, strict=True):
                 result[:, offsets + outcome] += mass[:, None]
             return result
         rows = np.repeat(np.arange(len(states)), n_samples)
@@ -201,7 +201,7 @@ class ConditionalBoltzmannMachine(BaseTransitionModel):
         if self.n_outcomes > ENUMERATED:
             raise NotImplementedError(
                 f"A Boltzmann machine over {self.n_outcomes:.3g} joint outcomes has no exact probabilities; "
-                f"they are listed up to {ENUMERATED:,}."
+                f"these are available for at most {ENUMERATED:,} outcomes."
             )
         outcomes = np.concatenate([next_states, terminated[:, None]], axis=1).astype(np.int64)
         place = np.ravel_multi_index(tuple(outcomes.T), self.codec.outputs)
@@ -212,11 +212,11 @@ class ConditionalBoltzmannMachine(BaseTransitionModel):
     @torch.no_grad()
     def _log_probabilities(self, states: States, actions: Actions) -> Floats:
         """Log-probabilities [B, Y] of all joint outcomes, in the order of ``itertools.product``."""
-        every, parts = self._every_outcome(), []
+        all_outcomes, parts = self._all_outcomes(), []
         for begin in range(0, len(states), 256):
             inputs = self.codec.inputs(*_tensors(states[begin : begin + 256], actions[begin : begin + 256]))
-            parts.append(torch.log_softmax(self._goodness(inputs, every).double(), dim=1))
-        return torch.cat(parts).numpy() if parts else np.zeros((0, len(every)))
+            parts.append(torch.log_softmax(self._scores(inputs, all_outcomes).double(), dim=1))
+        return torch.cat(parts).numpy() if parts else np.zeros((0, len(all_outcomes)))
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """See TransitionModel."""
@@ -226,12 +226,12 @@ class ConditionalBoltzmannMachine(BaseTransitionModel):
         """See TransitionModel.
 
         Raises:
-            ValueError: the arrays are not those of a machine of this shape; nothing is changed then.
+            ValueError: the arrays do not have the shapes of this model; nothing is changed then.
         """
         own = {name: tuple(value.shape) for name, value in self.weights.items()}
         given = {name: np.shape(value) for name, value in state.items()}
         if own != given:
-            raise ValueError(f"This machine has arrays of shapes {own}, but was given {given}; build it with the same size.")
+            raise ValueError(f"This model has arrays of shapes {own}, but was given {given}; build it with the same size.")
         for name, value in state.items():
             self.weights[name].data = torch.from_numpy(np.array(value, dtype=np.float32))
 

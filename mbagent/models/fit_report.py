@@ -71,14 +71,14 @@ class FitReport:
         if not self.memory:
             return None
         return (
-            f"The step before tells the model {self.memory:.2g} nats a transition more than the observation and the action do: "
-            "the next state seems to hang on more than these; wrap the environment in mbagent.wrappers.History(env, k)."
+            f"The previous step improves predictions by {self.memory:.2g} nats per transition, so the next state seems to depend "
+            "on more than the observation and the action; wrap the environment in mbagent.wrappers.History(env, k)."
         )
 
     def table(self, most: int = 20) -> str:
         """The variables with the lowest log-likelihood, as text."""
         worst = sorted(self.variables, key=lambda variable: variable.log_likelihood)[:most]
-        lines = [f"{'variable':24} {'log-likelihood':>14} {'calibration':>11}  hangs on"]
+        lines = [f"{'variable':24} {'log-likelihood':>14} {'calibration':>11}  depends on"]
         for variable in worst:
             parents = ", ".join(variable.parents[:8]) + (", …" if len(variable.parents) > 8 else "")
             figures = f"{variable.log_likelihood:14.4f} {variable.calibration:11.4f}"
@@ -90,8 +90,8 @@ def calibration_error(probabilities: Floats, came: NDArray[np.bool_]) -> float:
     """Mean distance of predicted probabilities from the frequencies of their bins (Naeini et al. 2015); both of any shape."""
     bins = np.minimum((probabilities.ravel() * BINS).astype(np.int64), BINS - 1)
     predicted = np.bincount(bins, weights=probabilities.ravel(), minlength=BINS)
-    met = np.bincount(bins, weights=came.ravel().astype(np.float64), minlength=BINS)
-    return float(np.abs(predicted - met).sum() / max(probabilities.size, 1))
+    observed = np.bincount(bins, weights=came.ravel().astype(np.float64), minlength=BINS)
+    return float(np.abs(predicted - observed).sum() / max(probabilities.size, 1))
 
 
 @dataclass(frozen=True)
@@ -119,12 +119,12 @@ def describe(
     start = np.concatenate([[0], np.cumsum(cardinalities)]).astype(np.int64)
     at = start[:-1] + rows.after
     logs = np.log(np.take_along_axis(probabilities, at, axis=1).clip(1e-12)).mean(axis=0)
-    came = np.zeros(probabilities.shape, dtype=np.bool_)
-    np.put_along_axis(came, at, True, axis=1)
+    observed = np.zeros(probabilities.shape, dtype=np.bool_)
+    np.put_along_axis(observed, at, True, axis=1)
     reports = []
     for variable in variables:
         columns = np.concatenate([np.arange(start[f], start[f + 1]) for f in variable.factors])
-        error = calibration_error(probabilities[:, columns], came[:, columns])
+        error = calibration_error(probabilities[:, columns], observed[:, columns])
         total = float(logs[list(variable.factors)].sum())
         reports.append(VariableReport(variable.name, variable.factors, total, error, variable.parents))
-    return tuple(reports), calibration_error(probabilities, came)
+    return tuple(reports), calibration_error(probabilities, observed)

@@ -65,18 +65,18 @@ def with_past(
     """
     shape: tuple[int, ...] = (len(cardinalities),) if board is None else (board.channels, board.height, board.width)
 
-    def laid_out(states: NDArray[np.int64]) -> NDArray[np.int64]:
+    def arranged(states: NDArray[np.int64]) -> NDArray[np.int64]:
         return states if board is None else board.to_planes(states)
 
-    def shown(states: NDArray[np.int64], past: NDArray[np.int64], actions: NDArray[np.int64]) -> NDArray[np.int64]:
+    def with_history(states: NDArray[np.int64], past: NDArray[np.int64], actions: NDArray[np.int64]) -> NDArray[np.int64]:
         bits = action_feature_table(encoding, actions).astype(np.int64)
         bits = bits if board is None else np.broadcast_to(bits[:, :, None, None], (*bits.shape, *shape[1:]))
-        return np.concatenate([laid_out(states), laid_out(past), bits], axis=1)
+        return np.concatenate([arranged(states), arranged(past), bits], axis=1)
 
-    cards = laid_out(np.asarray(cardinalities)[None])[0]
+    cards = arranged(np.asarray(cardinalities)[None])[0]
     twos = np.full((encoding.n_features, *shape[1:]), 2)
     sizes = np.concatenate([cards, cards, twos])
     space = FactoredSpace(spaces.MultiBinary(sizes.shape) if (sizes == 2).all() else spaces.MultiDiscrete(sizes))
-    states = space.encode(shown(now.states, before.states, before.actions))
-    following = space.encode(shown(now.next_states, now.states, now.actions))
+    states = space.encode(with_history(now.states, before.states, before.actions))
+    following = space.encode(with_history(now.next_states, now.states, now.actions))
     return space, TransitionBatch(states, now.actions, following, now.terminated, now.rewards, now.episodes)

@@ -135,12 +135,12 @@ def _expand_all(kernel: Any, graph: GraphArrays, nodes: Ints, n_samples: int, ke
     """Expands nodes [B] as long as the arrays have capacity; returns the number of expanded nodes."""
     n_actions, most = graph.counts.shape[1], most_outcomes(graph.counts.shape[1], n_samples)
     made = work_for(kernel, n_samples), room_for_outcomes(n_actions, graph.states.shape[1], n_samples)
-    lent, kernel, graph = borrowed(made), borrowed(kernel), borrowed(graph)
+    work_out, kernel, graph = borrowed(made), borrowed(kernel), borrowed(graph)
     done = 0
     for node in nodes:
         if graph.sizes[0] + most > len(graph.states) or graph.sizes[1] + most > len(graph.sources):
             break
-        expand_with(kernel, lent[0], graph, node, n_samples, key, offset, lent[1])
+        expand_with(kernel, work_out[0], graph, node, n_samples, key, offset, work_out[1])
         done += 1
     return done + 0 * len(made[1].counts)  # the borrowed arrays must live until here
 
@@ -395,7 +395,7 @@ def reachable_mdp(
     """
     for name, value in (("max_states", max_states), ("n_samples", n_samples), ("the number of start states", len(start))):
         if value < 1:
-            raise ValueError(f"A machine needs at least one of each, but {name} is {value}; give 1 or more.")
+            raise ValueError(f"A reachable MDP needs at least one of each, but {name} is {value}; give 1 or more.")
     graph, complete = grow_reachable(model, start, max_states, n_samples, seed)
     order = np.lexsort((graph.actions, graph.sources))
     counts = graph.counts

@@ -22,7 +22,7 @@ BELIEVED = 20.0
 """Weight of the uncalibrated doubts in the calibration, in held-out transitions."""
 
 
-_AS_IT_STANDS = np.array([0.0, 1.0]), np.array([0.0, 1.0])
+_IDENTITY = np.array([0.0, 1.0]), np.array([0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -102,9 +102,9 @@ def estimate_error(
     without = {pair: fitted(~np.isin(part, pair)) for pair in itertools.combinations(range(n_members), 2)}
     doubts, wrong = [], []
     for number, member in enumerate(members):
-        fewer = tuple(other for pair, other in without.items() if number in pair)
+        others = tuple(other for pair, other in without.items() if number in pair)
         held_out = rows.select(part == number)
-        doubts.append(ModelError(member, fewer, *_AS_IT_STANDS).doubt(held_out.states, held_out.actions))
+        doubts.append(ModelError(member, others, *_IDENTITY).doubt(held_out.states, held_out.actions))
         wrong.append(missed(member, held_out))
     return ModelError(model, members, *_calibrated(np.concatenate(doubts), np.concatenate(wrong)))
 
@@ -136,9 +136,9 @@ def parts_of(rows: TransitionBatch, n_parts: int, seed: int) -> Ints:
 
 def likeliest(model: TransitionModel, states: States, actions: Actions) -> tuple[States, Bools]:
     """Likeliest next states, int64 [B, F], and terminated, bool [B]: by the model's method, or factor by factor."""
-    own = getattr(model, "likeliest", None)
-    if own is not None:
-        found: tuple[States, Bools] = own(states, actions)
+    method = getattr(model, "likeliest", None)
+    if method is not None:
+        found: tuple[States, Bools] = method(states, actions)
         return found
     probs, start = model.marginals(states, actions), np.concatenate([[0], np.cumsum(model.cardinalities)])
     columns = [probs[:, begin:end].argmax(axis=1) for begin, end in itertools.pairwise(start)]

@@ -94,7 +94,7 @@ def as_keys(rng: Randomness, n: int) -> Keys:
     if isinstance(rng, np.random.Generator):
         return rng.integers(0, 2**64, size=n, dtype=np.uint64)
     if len(rng) != n:
-        raise ValueError(f"{len(rng)} random keys were given for {n} rows; give one key a row.")
+        raise ValueError(f"{len(rng)} random keys were given for {n} rows; give one key for each row.")
     return rng
 
 

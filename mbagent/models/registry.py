@@ -122,7 +122,7 @@ def register_model(name: str, factory: ModelFactory) -> None:
         ValueError: the name is in use.
     """
     if name in _FACTORIES and _FACTORIES[name] is not factory:
-        raise ValueError(f"A model called {name!r} is registered already; choose another name.")
+        raise ValueError(f"A model called {name!r} is already registered; choose another name.")
     _FACTORIES[name] = factory
 
 

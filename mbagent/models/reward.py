@@ -157,14 +157,14 @@ class RewardReport:
         if self.since:
             return (
                 f"The environment's rewards changed after about {self.since:,} steps, so the agent plans with those observed "
-                "since then; when you change rewards, give the new goal with set_reward(fn), or call set_env(env), which starts "
-                "the rewards afresh."
+                "since then; when you change rewards, give the new goal with set_reward(fn), or call set_env(env), after which "
+                "earlier rewards are ignored."
             )
         if self.contrary > CONTRARY:
             return (
                 f"{self.contrary:.1%} of rewards differ from what the same observation, action and next observation earned "
-                "before, so the reward is random or hangs on what is not observed (time, history); the agent plans with means. "
-                "mbagent.wrappers.History may show what is missing."
+                "before, so the reward is random or depends on something unobserved (time, history); the agent plans with mean "
+                "rewards. mbagent.wrappers.History may add what is missing."
             )
         if self.held_out < 1.0 - WRONG:
             return (
@@ -245,7 +245,7 @@ class LearnedReward:
             if self._graphs is None:
                 self._train(distinct, torch.from_numpy(weights), TRAINING_STEPS // 2 if trained else TRAINING_STEPS)
         right = self._share_right(distinct, weights)
-        return RewardReport(len(values), right, held_out, _contrary(rows))
+        return RewardReport(len(values), right, held_out, _contrary_share(rows))
 
     def _choose(self, train: TransitionBatch, tests: TransitionBatch) -> tuple[float, bool]:
         """Fits graphs and, unless they are perfect, a network; keeps the one that predicts the test rows better.
@@ -265,11 +265,11 @@ class LearnedReward:
             return right, False
         self._graphs = None
         self._train_on(train)
-        gain, told = self._errors(tests) - errors, missed <= self._missed(train)
+        gain, fewer_misses = self._errors(tests) - errors, missed <= self._missed(train)
         spread = 2.0 * float(gain.std()) / len(gain) ** 0.5
         # With random rewards, test rows hardly distinguish means, and those of graphs are the means of the training rows.
-        least = -spread if _contrary(train) > 0.0 else 0.0
-        if gain.mean() > spread or (gain.mean() >= least and told):
+        least = -spread if _contrary_share(train) > 0.0 else 0.0
+        if gain.mean() > spread or (gain.mean() >= least and fewer_misses):
             self._graphs = graphs
             return right, bool(gain.mean() > spread)
         return self._share_right(tests), False
@@ -284,10 +284,10 @@ class LearnedReward:
         Their rewards are averaged over all rows with the same observation, action and next observation, which cannot be
         distinguished.
         """
-        off, numbers = self._order[0], _numbered(rows)
+        off, numbers = self._order[0], _triple_indices(rows)
         means = (np.bincount(numbers, weights=rows.rewards) / np.bincount(numbers))[numbers]
-        told = np.abs(self(rows.states, rows.actions, rows.next_states) - off)
-        return int((told < 0.5 * np.abs(means - off)).sum())
+        predicted = np.abs(self(rows.states, rows.actions, rows.next_states) - off)
+        return int((predicted < 0.5 * np.abs(means - off)).sum())
 
     def _as_graphs(self, rows: TransitionBatch) -> ClassGraphs | None:
         """Decision graphs for the rewards of some rows; None if there are too many distinct ones."""
@@ -309,7 +309,7 @@ class LearnedReward:
         order = np.concatenate([[common], np.delete(np.arange(len(self._values)), common)])
         return fit_classes(rows, np.argsort(order)[number], self._codec.cardinalities, self._parts, self._planes), order
 
-    def _chances(self, train: TransitionBatch, rows: TransitionBatch) -> Floats:
+    def _probabilities(self, train: TransitionBatch, rows: TransitionBatch) -> Floats:
         """Probability [N, K] of each reward of ``rows``, as predicted by graphs fitted to ``train``."""
         graphs, order = self._class_graphs(train)
         parts = (np.ascontiguousarray(part) for part in (rows.states, rows.actions, rows.next_states))
@@ -322,13 +322,13 @@ class LearnedReward:
         order = np.argsort(rows.episodes, kind="stable")  # episode by episode, since episodes of several environments alternate
         rows = rows.select(order)
         keys, values, since = triples(rows), self._numbers(rows.rewards), 0
-        while found := self._turn(rows.select(slice(since, None)), keys[since:], values[since:]):
+        while found := self._change_point(rows.select(slice(since, None)), keys[since:], values[since:]):
             since += found
         if not since:
             return 0, order
         hold = np.arange(len(rows)) >= since
         if self._few:  # older rows not observed again are still valid, unless similar transitions have another reward now
-            old, new = (self._chances(rows.select(part), rows) for part in (~hold, hold))
+            old, new = (self._probabilities(rows.select(part), rows) for part in (~hold, hold))
             cells = np.unique(np.concatenate([old, new], axis=1), axis=0, return_inverse=True)[1].ravel()
             hold[:since] = still_hold(cells, values, since) & ~np.isin(keys[:since], keys[since:])
         return since, np.sort(order[hold])
@@ -339,7 +339,7 @@ class LearnedReward:
             return np.searchsorted(self._values, rewards)
         return np.searchsorted(np.quantile(rewards, np.arange(1, MAX_GRAPHS) / MAX_GRAPHS), rewards)
 
-    def _turn(self, rows: TransitionBatch, keys: NDArray[np.int64], values: NDArray[np.int64]) -> int:
+    def _change_point(self, rows: TransitionBatch, keys: NDArray[np.int64], values: NDArray[np.int64]) -> int:
         """The row from which rewards differ from those before, or 0."""
         found = turn(keys, values, rows.episodes)
         half = len(rows) // 2
@@ -347,13 +347,13 @@ class LearnedReward:
             return found
         # If transitions are hardly ever repeated, those with the same prediction of graphs are grouped. Since a covariate shift
         # could then look like a change, a fit to the rows after it must also predict better than one to all rows.
-        chances = self._chances(rows, rows)
-        found = turn(np.unique(chances, axis=0, return_inverse=True)[1].ravel(), values, rows.episodes)
+        probabilities = self._probabilities(rows, rows)
+        found = turn(np.unique(probabilities, axis=0, return_inverse=True)[1].ravel(), values, rows.episodes)
         if not found:
             return 0
         tested = (np.arange(len(rows)) >= found) & (np.arange(len(rows)) % 3 == 0)
         tests, known = rows.select(tested), [~tested, ~tested & (np.arange(len(rows)) >= found)]
-        errors = [(self._chances(rows.select(train), tests) @ self._values - tests.rewards) ** 2 for train in known]
+        errors = [(self._probabilities(rows.select(train), tests) @ self._values - tests.rewards) ** 2 for train in known]
         gain = errors[0] - errors[1]
         return found if gain.mean() > 2.0 * gain.std() / len(gain) ** 0.5 else 0
 
@@ -363,8 +363,8 @@ class LearnedReward:
         return errors
 
     def _share_right(self, rows: TransitionBatch, weights: NDArray[np.float32] | None = None) -> float:
-        reach = float(np.ptp(self._values)) if self._classes else 6.0 * float(self._values[1])
-        close = np.abs(self(rows.states, rows.actions, rows.next_states) - rows.rewards) <= 0.005 * max(reach, 1e-12)
+        value_range = float(np.ptp(self._values)) if self._classes else 6.0 * float(self._values[1])
+        close = np.abs(self(rows.states, rows.actions, rows.next_states) - rows.rewards) <= 0.005 * max(value_range, 1e-12)
         return float(np.average(close, weights=weights))
 
     def _train(self, rows: TransitionBatch, weights: Tensor, steps: int) -> None:
@@ -391,8 +391,8 @@ class LearnedReward:
         if self._classes:
             errors = []
             for self._floor in (0.0, FLOOR):
-                told = self(rows.states, rows.actions, rows.next_states)
-                errors.append(float((weights.double().numpy() * (told - rows.rewards) ** 2).sum()))
+                predicted = self(rows.states, rows.actions, rows.next_states)
+                errors.append(float((weights.double().numpy() * (predicted - rows.rewards) ** 2).sum()))
             self._floor = FLOOR if errors[1] <= errors[0] else 0.0
 
     def _compile(self) -> None:
@@ -406,8 +406,8 @@ class LearnedReward:
         if len(self._values) == 1:
             return np.full(len(actions), self._values[0])
         if self._graphs is not None:
-            parts_of = (np.ascontiguousarray(part, dtype=np.int64) for part in (states, actions, next_states))
-            return _weighed(class_chances(self._graphs, len(self._order), *parts_of), self._order)
+            arrays = (np.ascontiguousarray(part, dtype=np.int64) for part in (states, actions, next_states))
+            return _expected_values(class_chances(self._graphs, len(self._order), *arrays), self._order)
         if self._packed is not None:
             return self._expected(torch.from_numpy(reward_outputs(self._packed, states, actions, next_states))).numpy()
         parts = [np.zeros(0)]
@@ -423,7 +423,7 @@ class LearnedReward:
     def _expected(self, out: Tensor) -> Tensor:
         if not self._classes:
             return out[:, 0].double() * float(self._values[1]) + float(self._values[0])
-        return torch.from_numpy(_weighed(out.double().softmax(dim=1).numpy(), self._values, self._floor))
+        return torch.from_numpy(_expected_values(out.double().softmax(dim=1).numpy(), self._values, self._floor))
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """All weights, as arrays."""
@@ -490,21 +490,21 @@ def _distinct(rows: TransitionBatch) -> tuple[TransitionBatch, NDArray[np.float3
     return rows.select(first), shares.astype(np.float32)
 
 
-def _weighed(chances: Floats, values: Floats, floor: float = 0.0) -> Floats:
+def _expected_values(probabilities: Floats, values: Floats, floor: float = 0.0) -> Floats:
     """Expected values [M] by probabilities [M, K], of which those below ``floor`` are set to 0."""
-    p = np.where(chances < floor, 0.0, chances)
+    p = np.where(probabilities < floor, 0.0, probabilities)
     # Not a matrix product, whose rounding would depend on the number of rows.
     expected: Floats = (p / p.sum(axis=1, keepdims=True) * values).sum(axis=1)
     return expected
 
 
-def _numbered(rows: TransitionBatch) -> NDArray[np.int64]:
+def _triple_indices(rows: TransitionBatch) -> NDArray[np.int64]:
     """Index 0, 1, ... of each row's (s, a, s') among the distinct ones, int64 [N]."""
     result: NDArray[np.int64] = np.unique(triples(rows), return_inverse=True)[1]
     return result
 
 
-def _contrary(rows: TransitionBatch) -> float:
+def _contrary_share(rows: TransitionBatch) -> float:
     """Share of rows whose reward is not the commonest one of the same (s, a, s')."""
     bits = np.ascontiguousarray(rows.rewards + 0.0, dtype=np.float64).view(np.int64)  # -0.0 is 0.0
     pairs, counts = np.unique(np.stack([triples(rows), bits], axis=1), axis=0, return_counts=True)

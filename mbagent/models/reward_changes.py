@@ -56,15 +56,15 @@ def turn(groups: Ints, values: Ints, episodes: Ints) -> int:
     """
     groups = np.unique(groups, return_inverse=True)[1].ravel()
     pairs = np.unique(np.stack([groups, values]), axis=1, return_inverse=True)
-    kinds = np.bincount(pairs[0][0])  # number of distinct values of each group
-    varied = np.flatnonzero(kinds[groups] > 1)
+    n_distinct = np.bincount(pairs[0][0])  # number of distinct values of each group
+    varied = np.flatnonzero(n_distinct[groups] > 1)
     if not len(varied):
         return 0
     groups, labels, blocks = groups[varied], pairs[1].ravel()[varied], _blocks(episodes)[varied]
-    gains, rng, best = _gains(groups, labels, kinds), np.random.default_rng(0), 0.0
+    gains, rng, best = _gains(groups, labels, n_distinct), np.random.default_rng(0), 0.0
     for _ in range(ORDERS):
         order = np.argsort(rng.permutation(blocks[-1] + 1)[blocks], kind="stable")
-        best = max(best, float(_gains(groups[order], labels[order], kinds).max()))
+        best = max(best, float(_gains(groups[order], labels[order], n_distinct).max()))
     found = int(gains.argmax())
     return int(varied[found + 1]) if gains[found] > CHANGE_EVIDENCE + TIMES * best else 0
 
@@ -78,8 +78,8 @@ def still_hold(cells: Ints, values: Ints, since: int) -> Bools:
         since: the row from which rewards differ.
     """
     cells = np.unique(cells, return_inverse=True)[1].ravel()
-    shape, late = (2, int(cells.max()) + 1, int(values.max()) + 1), (np.arange(len(cells)) >= since).astype(np.int64)
-    counts = np.bincount(np.ravel_multi_index((late, cells, values), shape), minlength=int(np.prod(shape))).reshape(shape)
+    shape, is_later = (2, int(cells.max()) + 1, int(values.max()) + 1), (np.arange(len(cells)) >= since).astype(np.int64)
+    counts = np.bincount(np.ravel_multi_index((is_later, cells, values), shape), minlength=int(np.prod(shape))).reshape(shape)
     n_kinds = (counts.sum(axis=0) > 0).sum(axis=1)
     gain = _evidence(counts[0], n_kinds) + _evidence(counts[1], n_kinds) - _evidence(counts.sum(axis=0), n_kinds)
     same: Bools = (gain <= 0.0)[cells[:since]]
@@ -93,12 +93,12 @@ def _evidence(counts: Ints, n_kinds: Ints) -> Floats:
     return result
 
 
-def _gains(groups: Ints, labels: Ints, kinds: Ints) -> Floats:
+def _gains(groups: Ints, labels: Ints, n_distinct: Ints) -> Floats:
     """Evidence [N] for a change after each row: rows up to it are predicted from earlier ones, the others from later ones."""
-    (rank, behind), (own, own_behind) = _ranks(groups), _ranks(labels)
-    prior = COUNT * kinds[groups]
+    (rank, remaining), (own, own_remaining) = _ranks(groups), _ranks(labels)
+    prior = COUNT * n_distinct[groups]
     forwards = np.log(own + COUNT) - np.log(rank + prior)
-    backwards = np.log(own_behind + COUNT) - np.log(behind + prior)
+    backwards = np.log(own_remaining + COUNT) - np.log(remaining + prior)
     gains: Floats = np.cumsum(forwards - backwards)
     return gains
 
@@ -115,7 +115,7 @@ def _blocks(episodes: Ints) -> Ints:
     """Index of each row's block, int [N], ascending; blocks are whole episodes or parts of long ones."""
     n, rows = len(episodes), np.arange(len(episodes))
     first = np.flatnonzero(np.r_[True, episodes[1:] != episodes[:-1]])
-    begun = first[np.searchsorted(first, rows, side="right") - 1]
+    start = first[np.searchsorted(first, rows, side="right") - 1]
     length = min(max(n // MOST_EPISODE_BLOCKS, 1), LONG_EPISODE)
-    blocks: Ints = np.unique(begun + (rows - begun) // length * length, return_inverse=True)[1].ravel()
+    blocks: Ints = np.unique(start + (rows - start) // length * length, return_inverse=True)[1].ravel()
     return blocks

@@ -66,8 +66,8 @@ class SimulatorModel(ExactModel):
         """
         found = self._listed(states, actions)
         rows = found.rows
-        met = (found.states == next_states[rows]).all(axis=1) & (found.terminated == terminated[rows])
-        mass = np.bincount(rows[met], weights=found.probabilities[met], minlength=len(states))
+        matches = (found.states == next_states[rows]).all(axis=1) & (found.terminated == terminated[rows])
+        mass = np.bincount(rows[matches], weights=found.probabilities[matches], minlength=len(states))
         with np.errstate(divide="ignore"):
             return np.log(mass)
 

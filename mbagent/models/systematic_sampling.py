@@ -214,7 +214,7 @@ def n_possible(values: Floats, start: int, n: int) -> int:
 
 
 @compiled
-def _set_apart(values: Floats, rare: Floats, n: int, n_grid: int) -> float:
+def _separate_rare(values: Floats, rare: Floats, n: int, n_grid: int) -> float:
     """Moves the probabilities of rare values to ``rare`` [n] and normalises the others; returns the sum of the rare ones.
 
     Rare values are below a bound of at most RARE_VALUE and ENOUGH_POINTS grid points, chosen such that their sum is below
@@ -238,40 +238,40 @@ def _set_apart(values: Floats, rare: Floats, n: int, n_grid: int) -> float:
 
 
 @compiled
-def share_out(p: Particles, only: int, unit: int, w: int, values: Floats, n: int, ends: bool, grid: Grid) -> None:
+def share_out(p: Particles, only: int, variable: int, w: int, values: Floats, n: int, ends: bool, grid: Grid) -> None:
     """Divides the particles among the values of a variable.
 
     Args:
         p: the particles.
         only: slot of one particle, if probabilities depend on its values so far (strata must precede main particles); -1 for all.
-        unit: number of the variable, for its random numbers.
+        variable: number of the variable, for its random numbers.
         w: number of the variable among the open ones: the column of ``Particles.factors`` for its values.
         values: probability of each value, summing to one, overwritten, [n].
         n: number of values.
         ends: whether the variable is ``terminated``.
         grid: see Grid.
     """
-    points, chances, factors, apart, state = p.grid, p.chances, p.factors, p.rare, p.state
-    n_grid, n_main, rare = grid[0], state[MAIN], 0.0
+    points, chances, factors, rare, state = p.grid, p.chances, p.factors, p.rare, p.state
+    n_grid, n_main, rare_mass = grid[0], state[MAIN], 0.0
     if state[LISTED]:
         for q in range(n_main if only < 0 else 1):
             _list_values(p, max(q, only), w, values, n)
         return
     for slot in range(n_grid, n_grid + state[STRATA]):
         if only < 0 or slot == only:
-            factors[slot, w] = draw(values, n, uniform_at(derive_one(grid[1], _LATER + np.uint64(slot)), unit))
+            factors[slot, w] = draw(values, n, uniform_at(derive_one(grid[1], _LATER + np.uint64(slot)), variable))
     if only >= n_grid:
         return
-    rare = _set_apart(values, apart, n, n_grid)
+    rare_mass = _separate_rare(values, rare, n, n_grid)
     for i in range(n_main if only < 0 else 1):
         q = max(i, only)
         here = points[q, POINTS] / n_grid * chances[q, ORIGINAL_SHARE]
-        for k in range(n if rare > 0.0 else 0):
-            if apart[k] > 0.0:
-                _add_stratum(p, q, unit, k, w, here * apart[k], ends, grid)
-        chances[q, MASS] *= 1.0 - rare
-        chances[q, ORIGINAL_SHARE] *= 1.0 - rare
-        state[MAIN] = _split(p, q, state[MAIN], unit, w, values, n, grid)
+        for k in range(n if rare_mass > 0.0 else 0):
+            if rare[k] > 0.0:
+                _add_stratum(p, q, variable, k, w, here * rare[k], ends, grid)
+        chances[q, MASS] *= 1.0 - rare_mass
+        chances[q, ORIGINAL_SHARE] *= 1.0 - rare_mass
+        state[MAIN] = _split(p, q, state[MAIN], variable, w, values, n, grid)
 
 
 @compiled
@@ -356,11 +356,11 @@ def _slot_for(p: Particles, tag: int, ends: bool, n_grid: int) -> int:
 
 
 @compiled
-def _add_stratum(p: Particles, q: int, unit: int, k: int, w: int, weight: float, ends: bool, grid: Grid) -> None:
+def _add_stratum(p: Particles, q: int, variable: int, k: int, w: int, weight: float, ends: bool, grid: Grid) -> None:
     """Adds main particle q with value k of a variable to the strata, with the given weight."""
     points, chances, factors, state = p.grid, p.chances, p.factors, p.state
     n_grid, key, _ = grid
-    tag = -1 - k if ends else unit * _TAG + k
+    tag = -1 - k if ends else variable * _TAG + k
     slot = _slot_for(p, tag, ends, n_grid)
     before, total = chances[slot, MASS], chances[slot, MASS] + weight
     if before > 0.0:
@@ -405,7 +405,7 @@ def weigh(p: Particles, n_grid: int) -> None:
 
 
 @compiled
-def write(p: Particles, base: Ints, still_open: Ints, n_open: int, n_grid: int, total: int, found: Found) -> int:
+def write(p: Particles, base: Ints, open_factors: Ints, n_open: int, n_grid: int, total: int, found: Found) -> int:
     """Writes a row's outcomes from index ``total`` on, ``base`` [O] with the open factors' values; returns their number."""
     _, states, terminated, probabilities, _ = found
     n_factors = states.shape[1]
@@ -413,7 +413,7 @@ def write(p: Particles, base: Ints, still_open: Ints, n_open: int, n_grid: int, 
     for i in range(n_outcomes(p)):
         slot = slot_of(p, i, n_grid)
         for w in range(n_open):
-            base[still_open[w]] = p.factors[slot, w]
+            base[open_factors[w]] = p.factors[slot, w]
         for f in range(n_factors):
             states[total + i, f] = base[f]
         terminated[total + i] = base[n_factors] == 1

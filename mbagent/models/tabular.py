@@ -55,7 +55,8 @@ class TabularMDP(ExactModel):
         lengths = {len(next_states), len(terminated), len(probabilities), int(offsets[-1])}
         if rest or len(lengths) > 1 or (np.diff(offsets) < 1).any() or not np.allclose(totals, 1.0):
             raise ValueError(
-                "A table needs outcomes for every (state, action), with one next state, end and probability each, summing to one."
+                "A table needs outcomes for every (state, action), each with next state, terminated and probability, the latter "
+                "summing to one."
             )
 
     def start_states(self, n: int, seed: int = 0) -> States:
@@ -89,9 +90,9 @@ class TabularMDP(ExactModel):
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
         """See TransitionModel."""
         found = self.successors(states, actions, len(self.probabilities), 0)
-        met = (found.states[:, 0] == next_states[found.rows, 0]) & (found.terminated == terminated[found.rows])
+        matches = (found.states[:, 0] == next_states[found.rows, 0]) & (found.terminated == terminated[found.rows])
         with np.errstate(divide="ignore"):
-            result: Floats = np.log(np.bincount(found.rows[met], weights=found.probabilities[met], minlength=len(states)))
+            result: Floats = np.log(np.bincount(found.rows[matches], weights=found.probabilities[matches], minlength=len(states)))
         return result
 
 
@@ -109,7 +110,7 @@ def toy_text_model(env: gym.Env[Any, Any]) -> tuple[TabularMDP, Callable[[Any, A
     unwrapped: Any = env.unwrapped
     if not hasattr(unwrapped, "P") or not hasattr(unwrapped, "initial_state_distrib"):
         raise TypeError(
-            f"{unwrapped} has no table of its rules: it lacks P or initial_state_distrib, as toy_text's tables have them."
+            f"{unwrapped} has no table of its rules: it lacks the attributes P or initial_state_distrib of toy_text environments."
         )
     table, n_actions = unwrapped.P, int(unwrapped.action_space.n)
     n_states = len(table)
@@ -217,8 +218,8 @@ class TabularModel(BaseTransitionModel):
         """See TransitionModel; minus infinity for outcomes of probability 0."""
         found = self._full(states, actions)
         rows = found.rows
-        met = (found.states == next_states[rows]).all(axis=1) & (found.terminated == terminated[rows])
-        mass = np.bincount(rows[met], weights=found.probabilities[met], minlength=len(states))
+        matches = (found.states == next_states[rows]).all(axis=1) & (found.terminated == terminated[rows])
+        mass = np.bincount(rows[matches], weights=found.probabilities[matches], minlength=len(states))
         with np.errstate(divide="ignore"):
             result: Floats = np.log(mass)
         return result
@@ -251,7 +252,7 @@ class TabularModel(BaseTransitionModel):
         wide = (len(state["counts"]), len(self.cardinalities))
         if np.shape(state["states"]) != wide or np.shape(state["next_states"]) != wide:
             raise ValueError(
-                f"This table is over states of {wide[1]} factors, but was given arrays of shape "
+                f"This table is for states of {wide[1]} factors, but was given arrays of shape "
                 f"{np.shape(state['states'])}; build the model for the space that the table was saved from."
             )
         states, actions, next_states, terminated, counts = (np.asarray(state[name]).astype(np.int64) for name in _ARRAYS)

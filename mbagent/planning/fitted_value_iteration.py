@@ -56,16 +56,16 @@ class PairRegression:
         self._column = np.full(int(counts.sum()), -1)
         self._column[used] = np.arange(len(used))
         self._x = csr_array((np.ones(len(rows)), (rows, column)), shape=(len(states), len(used)))
-        self._on, self._begin = self._shown(valued)
+        self._on, self._begin = self._active_features(valued)
         n_on = np.diff(self._begin)
         self._paired = len(used) <= MOST_PAIR_FEATURES and int((n_on * (n_on - 1) // 2).sum()) <= MOST_PAIRS
         shared = (self._x @ self._x.T).toarray()
         kernel = shared + (PAIRED / 2.0) * shared * (shared - 1.0) if self._paired else shared
-        self._typical = kernel.mean(axis=0)
-        centred = kernel - self._typical - self._typical[:, None] + self._typical.mean()
+        self._kernel_mean = kernel.mean(axis=0)
+        centred = kernel - self._kernel_mean - self._kernel_mean[:, None] + self._kernel_mean.mean()
         self._factor, self._bounds = cho_factor(centred + RIDGE * np.eye(len(states))), (low, high)
 
-    def _shown(self, states: States) -> tuple[Ints, Ints]:
+    def _active_features(self, states: States) -> tuple[Ints, Ints]:
         """Active features of states [M, F], concatenated, and the offset of each state's first one, int64 [M + 1]."""
         rows, factors = np.nonzero(states != self._common)
         column = self._column[self._first[factors] + states[rows, factors]]
@@ -75,10 +75,10 @@ class PairRegression:
     def fit(self, values: Floats) -> LeafValues:
         """Value function fitted to values [N] of the states."""
         mean, x = float(values.mean()), self._x
-        share = cho_solve(self._factor, values - mean)
-        pairs = PAIRED * (x.T @ x.multiply(share[:, None])).toarray() if self._paired else np.zeros((0, 0))
-        level = mean - float(share @ self._typical)
-        return LeafValues(self._common, self._first, self._column, level, x.T @ share, pairs, *self._bounds)
+        dual = cho_solve(self._factor, values - mean)
+        pairs = PAIRED * (x.T @ x.multiply(dual[:, None])).toarray() if self._paired else np.zeros((0, 0))
+        level = mean - float(dual @ self._kernel_mean)
+        return LeafValues(self._common, self._first, self._column, level, x.T @ dual, pairs, *self._bounds)
 
     def values(self, leaf: LeafValues) -> Floats:
         """Predicted values [M] of the states ``valued``."""
@@ -157,31 +157,31 @@ def learn_values(task: Task) -> tuple[LeafValues, States]:
     Returns:
         (values, or ``LOWEST_KNOWN`` if all rewards are equal; distinct states int64 [N, F] that were visited).
     """
-    leaf, met = LOWEST_KNOWN, np.zeros((0, len(task.model.cardinalities)), dtype=np.int64)
+    leaf, visited = LOWEST_KNOWN, np.zeros((0, len(task.model.cardinalities)), dtype=np.int64)
     for number in range(ITERATIONS):
         played = _play(task, leaf, number)
         rng = np.random.default_rng([task.seed, number])
-        some = rng.choice(len(played), size=min(len(played), STATES_A_ROUND), replace=False)
-        met = np.unique(np.concatenate([met, played[np.sort(some)]]), axis=0)
-        leaf = _fit(task, met, leaf, number)
-    return leaf, met
+        chosen = rng.choice(len(played), size=min(len(played), STATES_A_ROUND), replace=False)
+        visited = np.unique(np.concatenate([visited, played[np.sort(chosen)]]), axis=0)
+        leaf = _fit(task, visited, leaf, number)
+    return leaf, visited
 
 
 def _play(task: Task, leaf: LeafValues, number: int) -> States:
     """States int64 [N, F] visited by play that is greedy on the values, or random if there are none yet."""
     rng = np.random.default_rng([task.seed, number, _PLAY_SALT])
-    states, met = task.start[rng.integers(len(task.start), size=EPISODES)], []
+    states, visited = task.start[rng.integers(len(task.start), size=EPISODES)], []
     for step in range(EPISODE_STEPS):
-        met.append(states)
+        visited.append(states)
         actions = rng.integers(task.model.n_actions, size=EPISODES)
         if len(leaf.common):
-            by_chance = rng.random(EPISODES) < RANDOM_ACTION
-            actions = np.where(by_chance, actions, greedy_actions(task, leaf, states, number * EPISODE_STEPS + step))
+            is_random = rng.random(EPISODES) < RANDOM_ACTION
+            actions = np.where(is_random, actions, greedy_actions(task, leaf, states, number * EPISODE_STEPS + step))
         keys = derive(task.seed, _SAMPLE_SALT, number * EPISODE_STEPS + step, np.arange(EPISODES))
-        after, over = task.model.sample(states, actions, keys)
-        again = task.start[rng.integers(len(task.start), size=EPISODES)]
-        states = np.where(over[:, None], again, after)
-    return np.concatenate(met)
+        after, terminated = task.model.sample(states, actions, keys)
+        restarts = task.start[rng.integers(len(task.start), size=EPISODES)]
+        states = np.where(terminated[:, None], restarts, after)
+    return np.concatenate(visited)
 
 
 def greedy_actions(task: Task, leaf: LeafValues, states: States, step: int) -> Actions:
@@ -213,16 +213,16 @@ def _fit(task: Task, states: States, leaf: LeafValues, number: int) -> LeafValue
     """Values fitted on distinct states int64 [N, F], starting from the values ``leaf``."""
     graph = StateGraph(task.model)
     graph.add(states, np.zeros(len(states), dtype=np.int64))
-    nodes, v, found, q, rewards = _expanded(task, graph, leaf, (ITERATIONS + number) * EPISODE_STEPS)
+    nodes, v, targets, q, rewards = _expanded(task, graph, leaf, (ITERATIONS + number) * EPISODE_STEPS)
     if rewards.min() == rewards.max():
         return LOWEST_KNOWN
     low, high = (float(end) / (1.0 - task.gamma) for end in (min(rewards.min(), 0.0), max(rewards.max(), 0.0)))
     regression = PairRegression(graph.states[nodes], task.model.cardinalities, graph.states, low, high)
-    moved = CONVERGED * float(np.abs(rewards).max())
+    tolerance = CONVERGED * float(np.abs(rewards).max())
     for _ in range(SWEEPS):
-        _back_up(graph.arrays, rewards, task.gamma, nodes, v, q, found)
-        leaf, before = regression.fit(found), v
+        _back_up(graph.arrays, rewards, task.gamma, nodes, v, q, targets)
+        leaf, before = regression.fit(targets), v
         v = regression.values(leaf)
-        if np.abs(v - before).max() <= moved:
+        if np.abs(v - before).max() <= tolerance:
             break
     return leaf if np.isfinite(leaf.mean) and np.isfinite(leaf.weights).all() else LOWEST_KNOWN

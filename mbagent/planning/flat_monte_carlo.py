@@ -15,7 +15,7 @@ from mbagent.planning.value_iteration import score_edges
 from mbagent.types import Actions, Floats, Keys, Reward, States
 from mbagent_envs.random_keys import derive, uniforms
 
-_STRING = 1 << 32
+_SEQUENCE = 1 << 32
 """Salt of the random numbers of action sequences: larger than any depth, so that no step uses the same numbers."""
 
 
@@ -79,15 +79,15 @@ def forecast_returns(
         float64 [B].
     """
     total = np.zeros(len(states))
-    strings = (uniforms(derive(keys, _STRING), horizon) * model.n_actions).astype(np.int64)
-    strings[:, 0] = first_actions
+    sequences = (uniforms(derive(keys, _SEQUENCE), horizon) * model.n_actions).astype(np.int64)
+    sequences[:, 0] = first_actions
     for depth in range(horizon):
         step_keys = derive(keys, depth)
-        reached, over = model.forecast(states, strings[:, :depth], derive(step_keys, 1))
-        alive = np.flatnonzero(~over)
-        here, actions = reached[alive], strings[alive, depth]
-        next_states, _ = model.sample(here, actions, step_keys[alive])
-        total[alive] += gamma**depth * goal(here, actions, next_states)
+        reached, ended = model.forecast(states, sequences[:, :depth], derive(step_keys, 1))
+        alive = np.flatnonzero(~ended)
+        before, actions = reached[alive], sequences[alive, depth]
+        next_states, _ = model.sample(before, actions, step_keys[alive])
+        total[alive] += gamma**depth * goal(before, actions, next_states)
     return total
 
 
@@ -147,11 +147,11 @@ class FlatMonteCarlo:
         # Common random numbers: simulation k uses the same ones for every action.
         noise = derive(settings.seed, np.arange(done, done + each))
         keys = np.tile(noise, len(roots) * n_actions)
-        given = (goal, roots[rows], keys, settings.horizon, settings.gamma, actions)
+        arguments = (goal, roots[rows], keys, settings.horizon, settings.gamma, actions)
         if settings.forecasts == "direct":
-            returns = forecast_returns(direct_model(model), *given)
+            returns = forecast_returns(direct_model(model), *arguments)
         else:
-            returns = random_returns(model, *given)
+            returns = random_returns(model, *arguments)
         return returns.reshape(len(roots), n_actions, each)
 
     def trace(self, root: States) -> PlanTrace:
@@ -173,7 +173,7 @@ def direct_model(model: TransitionModel) -> DirectForecastModel:
     """
     if not isinstance(model, DirectForecastModel):
         raise ValueError(
-            f"forecasts='direct' needs a model with forecasts of several steps, not a {type(model).__name__}; "
+            f"forecasts='direct' needs a model with direct forecasts of several steps, not a {type(model).__name__}; "
             "give the agent model='direct'."
         )
     return model

@@ -106,8 +106,8 @@ class GraphSearch(ValueIterationPlanner):
         graph, settings = self._empty_graph(), self.settings
         nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
         grow_lookahead(graph, nodes, settings.lookahead_states, settings.lookahead_samples, settings.horizon, settings.seed)
-        nothing, n_simulations = np.zeros((len(graph), graph.model.n_actions)), settings.num_simulations
-        first = Values(nothing[:, 0].copy(), nothing, score_edges(graph, self._known_goal()), np.zeros(len(roots)))
+        zeros, n_simulations = np.zeros((len(graph), graph.model.n_actions)), settings.num_simulations
+        first = Values(zeros[:, 0].copy(), zeros, score_edges(graph, self._known_goal()), np.zeros(len(roots)))
         settle(graph, first, settings.gamma, FIRST_SWEEPS)
         tables = _tables(graph, first, len(roots), min(settings.wave, n_simulations), settings.horizon)
         weigh(graph.arrays, tables, settings.gamma, 0)

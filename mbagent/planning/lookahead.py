@@ -103,8 +103,8 @@ def grow_around(
         the remaining budget; 0 if nothing remains to be expanded.
     """
     n_actions = graph.counts.shape[1]
-    made = work_for(kernel, n_samples), room_for_outcomes(n_actions, graph.states.shape[1], n_samples)
-    work_out, kernel, graph = borrowed(made), borrowed(kernel), borrowed(graph)
+    arrays = work_for(kernel, n_samples), room_for_outcomes(n_actions, graph.states.shape[1], n_samples)
+    work_out, kernel, graph = borrowed(arrays), borrowed(kernel), borrowed(graph)
     waiting, chosen, n = np.empty(len(graph.tags), dtype=np.int64), np.empty(budget, dtype=np.int64), 0
     if not graph.expanded[root]:
         reach[root], depth[root] = 1.0, 0
@@ -119,15 +119,15 @@ def grow_around(
         if size == 0:
             budget = 0
             break
-        most = most_outcomes(n_actions, n_samples) * size
-        if graph.sizes[0] + most > len(graph.tags) or graph.sizes[1] + most > len(graph.sources):
+        n_needed = most_outcomes(n_actions, n_samples) * size
+        if graph.sizes[0] + n_needed > len(graph.tags) or graph.sizes[1] + n_needed > len(graph.sources):
             break
         for i in range(size):
             chosen[i] = waiting[i]
         n = _drop(waiting, n, size)
         n = _expand_levels(kernel, work_out, graph, chosen[:size], waiting, n, n_samples, seed, reach, depth)
         budget -= size
-    return budget + 0 * len(made[1].counts)  # the borrowed arrays must live until here
+    return budget + 0 * len(arrays[1].counts)  # the borrowed arrays must live until here
 
 
 @compiled
@@ -221,7 +221,7 @@ def grow_lookahead(graph: StateGraph, roots: NDArray[np.int64], max_states: int,
             draws = _draws(sizes, n_samples)[graph.groups[layer]]
             for n in np.unique(draws):
                 graph.expand(layer[draws == n], int(n), layer_seed(seed, int(level)))
-        reach, depth = _follow(graph, start, reach, depth)
+        reach, depth = _update_reach(graph, start, reach, depth)
 
 
 def _likeliest(
@@ -239,7 +239,7 @@ def _likeliest(
     return nodes[place_in_group(groups) < budget[groups]]
 
 
-def _follow(
+def _update_reach(
     graph: StateGraph, start: int, reach: NDArray[np.float64], depth: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Reach and depth of all nodes after the edges from number ``start`` on were added.
@@ -281,8 +281,8 @@ def _grow_compiled(graph: StateGraph, roots: NDArray[np.int64], max_states: int,
         budget, begin, at_once = max_states, len(graph), 64
         reach, depth = np.zeros(0), np.zeros(0, dtype=np.int64)
         while budget > 0:
-            most = most_outcomes(n_actions, n_samples) * min(budget, at_once)
-            graph.reserve(most, most)
+            n_needed = most_outcomes(n_actions, n_samples) * min(budget, at_once)
+            graph.reserve(n_needed, n_needed)
             more = len(graph.arrays.tags) - len(reach)
             reach, depth = np.append(reach, np.zeros(more)), np.append(depth, np.zeros(more, dtype=np.int64))
             left = grow_around(graph.kernel, graph.arrays, root, begin, budget, n_samples, horizon, seed, reach, depth)

@@ -91,7 +91,7 @@ class PlannerSettings:
             object.__setattr__(self, name, float(value))
         if not 0.0 < self.gamma < 1.0:
             raise ValueError(
-                f"gamma must lie between 0 and 1, both excluded, got {self.gamma!r}: the values of worlds without an end need a "
+                f"gamma must lie between 0 and 1, both excluded, got {self.gamma!r}: values of endless episodes need a "
                 "discount below 1; 0.99 is the default."
             )
         self._check_choices()
@@ -116,7 +116,7 @@ class PlannerSettings:
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} must be one of {allowed}, got {getattr(self, name)!r}.")
         if self.leaf_values == "rollouts" and self.backup == "max":
-            raise ValueError("leaf_values='rollouts' needs backup='mean': the maximum of random returns seeks luck.")
+            raise ValueError("leaf_values='rollouts' needs backup='mean': the maximum of random returns is risk-seeking.")
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ class ValueIterationPlanner:
         self._mdp: SolvedMdp | None = None
         self._expanded: StateGraph | None = None
         self._config: LookaheadConfig | None = None
-        self._described = False
+        self._warned = False
 
     def set_model(self, model: TransitionModel, start_states: States) -> None:
         """See Planner. The reachable MDP is generated at the next ``plan``."""
@@ -82,7 +82,7 @@ class ValueIterationPlanner:
         """See Planner. The reachable MDP is kept, its values are dropped."""
         if self._mdp is not None:
             self._mdp.values = None  # before the goal changes, so that an interrupt cannot leave values of another goal
-        self._goal, self._config, self._described = goal, None, False
+        self._goal, self._config, self._warned = goal, None, False
 
     def share_config(self, other: ValueIterationPlanner) -> None:
         """Copies the lookahead configuration of another planner of the same model and goal, if that has chosen one."""
@@ -98,24 +98,24 @@ class ValueIterationPlanner:
         if len(known) and mdp.graph is not None and mdp.values is not None:
             values[known] = mdp.values.q[nodes[known]]
             scores[known] = break_ties(mdp.graph, mdp.values.q, nodes[known], self.settings.gamma)
-            self._warn_of_doubt(mdp.bounds, nodes[known], scores[known], values[known])
+            self._warn_of_errors(mdp.bounds, nodes[known], scores[known], values[known])
         unknown = np.flatnonzero(nodes < 0)
         for begin in range(0, len(unknown), ROOTS_AT_ONCE):
-            some = unknown[begin : begin + ROOTS_AT_ONCE]
-            found = self._expand(roots[some])
-            values[some], visits[some], scores[some] = found.solution.q[found.nodes], found.visits, found.scores
-            if not self._described:
+            chunk = unknown[begin : begin + ROOTS_AT_ONCE]
+            found = self._expand(roots[chunk])
+            values[chunk], visits[chunk], scores[chunk] = found.solution.q[found.nodes], found.visits, found.scores
+            if not self._warned:
                 bounds = doubt(found.graph, found.solution, self.settings.gamma)
-                self._warn_of_doubt(bounds, found.nodes, scores[some], values[some])
+                self._warn_of_errors(bounds, found.nodes, scores[chunk], values[chunk])
         return Plan(best_actions(scores), values, visits)
 
-    def _warn_of_doubt(self, bounds: Floats | None, nodes: Ints, scores: Floats, values: Floats) -> None:
+    def _warn_of_errors(self, bounds: Floats | None, nodes: Ints, scores: Floats, values: Floats) -> None:
         """Warns, once for each goal, if rare outcomes that were merged with others could change the choice of an action."""
-        if self._described or bounds is None or not undecided(scores, values, bounds[nodes]).any():
+        if self._warned or bounds is None or not undecided(scores, values, bounds[nodes]).any():
             return
-        self._described, settings = True, self.settings
+        self._warned, settings = True, self.settings
         warnings.warn(
-            f"More outcomes are rare than plans have room for, so that others stand for some of them; values may be off by up to "
+            f"There are more rare outcomes than plans can represent, so some of them were merged; values may be off by up to "
             f"{bounds[nodes].max():.3g}, which could change the choice of an action: raise n_samples (now {settings.n_samples}) "
             f"and lookahead_samples (now {settings.lookahead_samples}) in policy_kwargs.",
             stacklevel=2,
@@ -129,8 +129,8 @@ class ValueIterationPlanner:
             return self._trace_of(self._expand(root), 0)
         graph, solution = mdp.graph, mdp.values
         scores = break_ties(graph, solution.q, nodes, self.settings.gamma)
-        nothing = np.zeros((1, graph.model.n_actions))
-        return self._trace_of(Expanded(graph, nodes, solution, nothing, scores), int(graph.expanded.sum()))
+        zeros = np.zeros((1, graph.model.n_actions))
+        return self._trace_of(Expanded(graph, nodes, solution, zeros, scores), int(graph.expanded.sum()))
 
     def _trace_of(self, found: Expanded, machine_states: int) -> PlanTrace:
         plan = Plan(best_actions(found.scores), found.solution.q[found.nodes], found.visits)
@@ -162,18 +162,18 @@ class ValueIterationPlanner:
         """Lookahead configuration for this goal: that of the settings, or the winner of a race if values are learned."""
         if self._config is None:
             settings, start = self.settings, self._start
-            usual = LookaheadConfig(LOWEST_KNOWN, settings.lookahead_states, settings.lookahead_samples)
+            default = LookaheadConfig(LOWEST_KNOWN, settings.lookahead_states, settings.lookahead_samples)
             if settings.learn_values and start is not None and len(start):
-                usual = self._race(usual, Task(self._known_model(), self._known_goal(), start, settings.gamma, settings.seed))
-            self._config = usual
+                default = self._race(default, Task(self._known_model(), self._known_goal(), start, settings.gamma, settings.seed))
+            self._config = default
         return self._config
 
-    def _race(self, usual: LookaheadConfig, task: Task) -> LookaheadConfig:
+    def _race(self, default: LookaheadConfig, task: Task) -> LookaheadConfig:
         """Learns leaf values for the goal; races the lookahead with them, the one without, and the values after one step."""
         settings = self.settings
-        leaf, met = learn_values(task)
+        leaf, visited = learn_values(task)
         if len(leaf.common) == 0:
-            return usual
+            return default
 
         def act(config: LookaheadConfig, states: States) -> Actions:
             self._config = config
@@ -181,8 +181,8 @@ class ValueIterationPlanner:
 
         try:
             self.settings = replace(settings, **RACED)
-            configs = (usual._replace(leaf=leaf), usual, LookaheadConfig(leaf, 1, settings.n_samples))
-            return best_config(replace(task, start=met), configs, act)
+            configs = (default._replace(leaf=leaf), default, LookaheadConfig(leaf, 1, settings.n_samples))
+            return best_config(replace(task, start=visited), configs, act)
         finally:  # if the goal fails here, the next call races again
             self.settings, self._config = settings, None
 
@@ -217,7 +217,7 @@ LEAF_SAMPLES = 4
 MAX_SEARCHED = 100_000
 """Number of nodes at which a search ends before its time budget is used; bounds the memory."""
 
-_SEARCH_SALT, _CARRIED_SALT = 0x5EA6C4, 0xCA1212
+_SEARCH_SALT, _REUSE_SALT = 0x5EA6C4, 0xCA1212
 
 
 class MctsPlanner(ValueIterationPlanner):
@@ -267,9 +267,9 @@ class MctsPlanner(ValueIterationPlanner):
         """Searches from each root [R, F]."""
         settings = self.settings
         deadline = None if settings.time_budget is None else time.perf_counter() + len(roots) * settings.time_budget
-        search = self._carried_on(roots) if settings.reuse_tree else None
+        search = self._reused_search(roots) if settings.reuse_tree else None
         if search is None:
-            begin = self._lookahead if settings.leaf_values == "machine" else self._bare_roots
+            begin = self._lookahead if settings.leaf_values == "machine" else self._expanded_roots
             graph, solution, nodes = begin(roots)
             search = _Search(self, graph, _first_tables(solution, nodes), nodes)
         found = search.run(deadline)
@@ -277,7 +277,7 @@ class MctsPlanner(ValueIterationPlanner):
             self._last = search
         return found
 
-    def _carried_on(self, roots: States) -> _Search | None:
+    def _reused_search(self, roots: States) -> _Search | None:
         """The last decision's search, with a new root; None if it has too few states after that, or too many in all."""
         last, self._last = self._last, None  # if the goal fails now, no incomplete search is kept
         if last is None or len(roots) != 1 or len(last.graph) > MAX_KEPT:
@@ -292,14 +292,14 @@ class MctsPlanner(ValueIterationPlanner):
         self._expanded, self._spare = graph, last.graph
         return _Search(self, graph, tables, np.zeros(1, dtype=np.int64), last.decision + 1)
 
-    def _bare_roots(self, roots: States) -> tuple[StateGraph, Values, Ints]:
+    def _expanded_roots(self, roots: States) -> tuple[StateGraph, Values, Ints]:
         """As ``_lookahead``, but only the roots are expanded, and all values are 0."""
         graph = self._empty_graph()
         nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
         graph.expand(nodes, self.settings.n_samples, self.settings.seed)
-        nothing = np.zeros((len(graph), graph.model.n_actions))
+        zeros = np.zeros((len(graph), graph.model.n_actions))
         rewards = score_edges(graph, self._known_goal())
-        return graph, Values(nothing[:, 0].copy(), nothing, rewards, np.zeros(len(roots))), nodes
+        return graph, Values(zeros[:, 0].copy(), zeros, rewards, np.zeros(len(roots))), nodes
 
 
 class _Search:
@@ -311,7 +311,7 @@ class _Search:
         rollouts = settings.leaf_values == "rollouts"
         prior = 0.0 if rollouts else settings.prior_visits
         # A reused tree must not see the random numbers that it was built with.
-        key = derive(settings.seed, _CARRIED_SALT, decision)[0] if decision else _key(settings.seed, 0)
+        key = derive(settings.seed, _REUSE_SALT, decision)[0] if decision else _key(settings.seed, 0)
         self.rules = Rules(settings.gamma, settings.c_uct, prior, rollouts, settings.backup == "mean", key)
         if not (rollouts and decision):
             measure_spans(graph.arrays, roots, self.tables)
@@ -321,26 +321,29 @@ class _Search:
         if deadline is not None:
             return self._run_until(deadline)
         settings, done = self.settings, 0
-        wave = min(settings.wave, settings.num_simulations)
-        paths, leaves = empty_paths(len(self.roots), wave, settings.horizon), np.empty(2 * len(self.roots) * wave, dtype=np.int64)
+        size = min(settings.wave, settings.num_simulations)
+        paths, leaves = (
+            empty_paths(len(self.roots), size, settings.horizon),
+            np.empty(2 * len(self.roots) * size, dtype=np.int64),
+        )
         while done < settings.num_simulations:
-            if settings.num_simulations - done < wave:
-                wave = settings.num_simulations - done
-                paths = empty_paths(len(self.roots), wave, settings.horizon)
+            if settings.num_simulations - done < size:
+                size = settings.num_simulations - done
+                paths = empty_paths(len(self.roots), size, settings.horizon)
             self._run_batch(paths, leaves, done)
-            done += wave
+            done += size
         return self._result()
 
     def _run_until(self, deadline: float) -> Expanded:
         """Runs at least one batch; further ones if they and the final value iteration should end before the deadline."""
-        wave, done, now = self.settings.wave, 0, time.perf_counter()
-        paths = empty_paths(len(self.roots), wave, self.settings.horizon)
-        leaves = np.empty(2 * len(self.roots) * wave, dtype=np.int64)
+        size, done, now = self.settings.wave, 0, time.perf_counter()
+        paths = empty_paths(len(self.roots), size, self.settings.horizon)
+        leaves = np.empty(2 * len(self.roots) * size, dtype=np.int64)
         last = 0.0
         while done == 0 or (now + last + self.planner.settling * len(self.graph) < deadline and len(self.graph) < MAX_SEARCHED):
             began = now
             self._run_batch(paths, leaves, done)
-            done, now = done + wave, time.perf_counter()
+            done, now = done + size, time.perf_counter()
             last = now - began
         found = self._result()
         self.planner.settling = (time.perf_counter() - now) / len(self.graph)
@@ -351,7 +354,7 @@ class _Search:
         n, m, visits = len(graph), graph.n_edges, self.tables.root_visits
         solution = Values(t.v[:n], t.q[:n], t.rewards[:m], t.frontier, t.leaf)
         if self.settings.backup == "mean":
-            return Expanded(graph, roots, solution, visits, visits + 1e-6 * _unit(t.q[roots]), t.visits[:n])
+            return Expanded(graph, roots, solution, visits, visits + 1e-6 * _scaled(t.q[roots]), t.visits[:n])
         settle(graph, solution, self.settings.gamma, FINAL_SWEEPS)
         return Expanded(graph, roots, solution, visits, break_ties(graph, solution.q, roots, self.settings.gamma))
 
@@ -360,8 +363,8 @@ class _Search:
         graph, rules = self.graph, self.rules
         n, n_widened = begin_batch(graph.arrays, self.roots, self.tables, rules, done, paths, leaves)
         n_nodes, n_edges, first = len(graph), graph.n_edges, paths.leaves.size
-        draws = self.settings.n_samples if rules.rollouts else LEAF_SAMPLES
-        graph.expand(leaves[:n], draws, int(_key(self.settings.seed, done + 1)))
+        n_samples = self.settings.n_samples if rules.rollouts else LEAF_SAMPLES
+        graph.expand(leaves[:n], n_samples, int(_key(self.settings.seed, done + 1)))
         self._make_room()
         self.tables.rewards[n_edges : graph.n_edges] = score_edges(graph, self.planner._known_goal(), n_edges)
         ends = self._rollouts(paths, done) if rules.rollouts else np.empty(paths.ends.shape)
@@ -400,9 +403,9 @@ def _first_tables(solution: Values, roots: Ints) -> Tables:
 
 
 @lru_cache(maxsize=4096)
-def _key(seed: int, wave: int) -> np.uint64:
-    """Key of the search's random numbers (0), and of the expansions of the batch after ``wave - 1`` simulations."""
-    key: np.uint64 = (derive(seed, _SEARCH_SALT) if wave == 0 else derive(seed, _SEARCH_SALT, wave))[0]
+def _key(seed: int, number: int) -> np.uint64:
+    """Key of the search's random numbers (0), and of the expansions of the batch after ``number - 1`` simulations."""
+    key: np.uint64 = (derive(seed, _SEARCH_SALT) if number == 0 else derive(seed, _SEARCH_SALT, number))[0]
     return key
 
 
@@ -412,8 +415,8 @@ def _longer(table: NDArray[np.float64], size: int) -> Floats:
     return longer
 
 
-def _unit(values: Floats) -> Floats:
+def _scaled(values: Floats) -> Floats:
     """Values [R, A], each row scaled to 0 ... 1, for breaking ties."""
     low, high = values.min(axis=1, keepdims=True), values.max(axis=1, keepdims=True)
-    unit: Floats = (values - low) / np.maximum(high - low, 1e-12)
-    return unit
+    scaled: Floats = (values - low) / np.maximum(high - low, 1e-12)
+    return scaled

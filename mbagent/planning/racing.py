@@ -69,8 +69,8 @@ def _plays_better(other: _Trial, best: _Trial) -> bool:
     for n_blocks in range(1, MOST_BLOCKS + 1):
         gains = other.returns(n_blocks) - best.returns(n_blocks)
         gain, error = float(gains.mean()), float(gains.std(ddof=1)) / RACED_EPISODES**0.5
-        alike = n_blocks > 1 and not gains.any()
-        if alike or gain < -HOPELESS * error or gain > SURELY * error:
+        identical = n_blocks > 1 and not gains.any()
+        if identical or gain < -HOPELESS * error or gain > SURELY * error:
             break
     return gain > CLEARLY * error
 
@@ -87,10 +87,10 @@ class _Trial:
     def returns(self, n_blocks: int) -> Floats:
         """Discounted return [RACED_EPISODES] of each episode after ``n_blocks`` blocks, or at its end if that is earlier."""
         while len(self._total) <= n_blocks * BLOCK_STEPS:
-            self._play()
+            self._step()
         return self._total[n_blocks * BLOCK_STEPS]
 
-    def _play(self) -> None:
+    def _step(self) -> None:
         """Simulates one step of all episodes that have not ended."""
         step, total = len(self._total) - 1, self._total[-1].copy()
         self._total.append(total)
@@ -98,6 +98,6 @@ class _Trial:
             return
         task, states = self._task, self._states
         actions = self._act(self.config, states)
-        after, over = task.model.sample(states, actions, derive(task.seed, _SALT, step, self._alive))
-        total[self._alive] += task.gamma**step * task.goal(states, actions, after)
-        self._alive, self._states = self._alive[~over], after[~over]
+        next_states, terminated = task.model.sample(states, actions, derive(task.seed, _SALT, step, self._alive))
+        total[self._alive] += task.gamma**step * task.goal(states, actions, next_states)
+        self._alive, self._states = self._alive[~terminated], next_states[~terminated]

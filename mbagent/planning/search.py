@@ -48,10 +48,10 @@ def choose(node: int, q: Floats, visits: Floats, prior_visits: float, weight: fl
     total = prior_visits * q.shape[1] + visits[node].sum()
     best, chosen = -np.inf, 0
     for a in range(q.shape[1]):
-        seen = prior_visits + visits[node, a]
+        n_visits = prior_visits + visits[node, a]
         score = np.inf
-        if seen > 0.0:
-            score = q[node, a] + weight * np.sqrt(np.log(total + 1.0) / seen)
+        if n_visits > 0.0:
+            score = q[node, a] + weight * np.sqrt(np.log(total + 1.0) / n_visits)
         if score > best:
             best, chosen = score, a
     return chosen
@@ -80,9 +80,9 @@ def select(
     in ``back_up_max`` or ``back_up_mean`` ("watch the unobserved", Liu et al. 2020). Simulation k uses the same random
     numbers for every root.
     """
-    n_roots, wave, horizon = edges.shape
+    n_roots, n_simulations, horizon = edges.shape
     for r in range(n_roots):
-        for w in range(wave):
+        for w in range(n_simulations):
             node, length, leaf = roots[r], 0, -1
             while length < horizon:
                 if not graph.expanded[node]:
@@ -116,9 +116,9 @@ def initialise(nodes: Ints, graph: GraphArrays, rewards: Floats, gamma: float, v
 @compiled
 def back_up_max(graph: GraphArrays, rewards: Floats, gamma: float, edges: Ints, lengths: Ints, v: Floats, q: Floats) -> None:
     """Bellman backups along every path, from its end to the root: trial-based heuristic tree search (Keller & Helmert 2013)."""
-    n_roots, wave, _ = edges.shape
+    n_roots, n_simulations, _ = edges.shape
     for r in range(n_roots):
-        for w in range(wave):
+        for w in range(n_simulations):
             for step in range(lengths[r, w] - 1, -1, -1):
                 node = graph.sources[edges[r, w, step]]
                 v[node] = bellman(node, graph, rewards, gamma, v, q)
@@ -144,9 +144,9 @@ def back_up_mean(
     ``counted`` [N, A], number of averaged returns; ``extremes`` [R, 2], lowest and highest return, from which ``spans`` [R]
     are computed. ``counted``, ``q``, ``spans`` and ``extremes`` are updated in place.
     """
-    n_roots, wave, _ = edges.shape
+    n_roots, n_simulations, _ = edges.shape
     for r in range(n_roots):
-        for w in range(wave):
+        for w in range(n_simulations):
             total = end_values[r, w]
             for step in range(lengths[r, w] - 1, -1, -1):
                 edge = edges[r, w, step]
@@ -226,8 +226,8 @@ def begin_batch(
         roots, graph, tables.q, tables.visits, tables.spans, rules.prior_visits, rules.c_uct, rules.key, done,
         paths.edges, paths.lengths, paths.leaves, paths.ends,
     )  # fmt: skip
-    n_roots, wave = paths.leaves.shape
-    n, n_widened, first = 0, 0, n_roots * wave
+    n_roots, n_simulations = paths.leaves.shape
+    n, n_widened, first = 0, 0, n_roots * n_simulations
     if not rules.rollouts:
         n_widened = _widen(graph, roots, paths, leaves[first:])
     found = np.empty(2 * first, dtype=np.int64)
@@ -249,10 +249,10 @@ def begin_batch(
 @compiled
 def _widen(graph: GraphArrays, roots: Ints, paths: Paths, out: Ints) -> int:
     """Writes the oldest unexpanded nodes, for each root as many as simulations visited only expanded ones; returns the number."""
-    n_roots, wave = paths.leaves.shape
+    n_roots, n_simulations = paths.leaves.shape
     allowance, total = np.zeros(n_roots, dtype=np.int64), 0
     for r in range(n_roots):
-        for w in range(wave):
+        for w in range(n_simulations):
             if paths.leaves[r, w] < 0 and paths.ends[r, w] >= 0:
                 allowance[r] += 1
                 total += 1

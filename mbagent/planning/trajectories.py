@@ -73,38 +73,38 @@ def likeliest_trajectories(trace: PlanTrace, n_futures: int, n_steps: int) -> li
     node without successors. The list is exact: a best-first search orders partial sequences by their probability times that
     of their most probable continuation, which is computed by dynamic programming.
     """
-    chances = _continuation_chances(trace, n_steps)
+    continuations = _continuations(trace, n_steps)
     n_actions = trace.graph.model.n_actions
-    return [list(islice(_in_order(trace, action, chances), n_futures)) for action in range(n_actions)]
+    return [list(islice(_in_order(trace, action, continuations), n_futures)) for action in range(n_actions)]
 
 
-def _continuation_chances(trace: PlanTrace, n_steps: int) -> list[Floats]:
+def _continuations(trace: PlanTrace, n_steps: int) -> list[Floats]:
     """Entry k: probability [N] of the most probable sequence of at most k further edges from each node."""
     graph = trace.graph
     followed = np.flatnonzero(graph.actions == trace.policy[graph.sources])
     sources, targets, p = graph.sources[followed], graph.next_nodes[followed], graph.probabilities[followed]
-    chances = [np.ones(len(graph))]
+    continuations = [np.ones(len(graph))]
     for _ in range(n_steps - 1):
-        here = np.where(trace.policy >= 0, 0.0, 1.0)
-        np.maximum.at(here, sources, p * np.where(graph.terminated[followed], 1.0, chances[-1][targets]))
-        chances.append(here)
-    return chances
+        best = np.where(trace.policy >= 0, 0.0, 1.0)
+        np.maximum.at(best, sources, p * np.where(graph.terminated[followed], 1.0, continuations[-1][targets]))
+        continuations.append(best)
+    return continuations
 
 
-def _in_order(trace: PlanTrace, action: int, chances: list[Floats]) -> Iterator[list[int]]:
-    graph, policy, n_steps = trace.graph, trace.policy, len(chances)
+def _in_order(trace: PlanTrace, action: int, continuations: list[Floats]) -> Iterator[list[int]]:
+    graph, policy, n_steps = trace.graph, trace.policy, len(continuations)
     waiting: list[tuple[float, list[int], float]] = []
 
     def begin(path: list[int], probability: float, bound: float, node: int, chosen: int) -> None:
         """Adds the continuations of a path by an action; ``bound``: probability of the path's most probable full sequence."""
         first = graph.first[node, chosen]
         for edge in range(first, first + graph.counts[node, chosen]):
-            here = probability * graph.probabilities[edge]
-            if here > 0.0:
-                ahead = 1.0 if graph.terminated[edge] else chances[n_steps - 1 - len(path)][graph.next_nodes[edge]]
-                best = here * ahead
+            joint = probability * graph.probabilities[edge]
+            if joint > 0.0:
+                ahead = 1.0 if graph.terminated[edge] else continuations[n_steps - 1 - len(path)][graph.next_nodes[edge]]
+                best = joint * ahead
                 # Rounding must not make equal probabilities differ: else none of many equal paths would be followed to its end.
-                heapq.heappush(waiting, (-(bound if best >= bound * (1.0 - _ROUNDING) else best), [*path, int(edge)], here))
+                heapq.heappush(waiting, (-(bound if best >= bound * (1.0 - _ROUNDING) else best), [*path, int(edge)], joint))
 
     begin([], 1.0, 1.0, trace.root, action)
     while waiting:

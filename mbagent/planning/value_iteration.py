@@ -68,8 +68,8 @@ def solve(graph: StateGraph, goal: Reward, gamma: float, n_groups: int = 1, leaf
         n_groups: groups of the graph are numbered 0 ... n_groups - 1.
         leaf: learned values of unexpanded states.
     """
-    nothing = np.zeros((len(graph), graph.model.n_actions))
-    values = Values(nothing[:, 0].copy(), nothing, score_edges(graph, goal), np.zeros(n_groups), leaf)
+    zeros = np.zeros((len(graph), graph.model.n_actions))
+    values = Values(zeros[:, 0].copy(), zeros, score_edges(graph, goal), np.zeros(n_groups), leaf)
     evaluate(leaf, graph.states, graph.expanded, values.v)
     settle(graph, values, gamma)
     return values
@@ -181,16 +181,16 @@ def break_ties(graph: StateGraph, q: Floats, roots: Ints, gamma: float) -> Float
     tied = scores >= top - slack
     if (tied.sum(axis=1) < 2).all() or graph.expanded[graph.next_nodes[~graph.terminated]].all():
         return scores
-    news = np.zeros_like(q)
-    _lead_to_news(graph.arrays, q, VALUE_TIE, gamma, MAX_NEWS_SWEEPS, news)
-    found = news[roots]
+    reach = np.zeros_like(q)
+    _reach_unexpanded(graph.arrays, q, VALUE_TIE, gamma, MAX_NEWS_SWEEPS, reach)
+    found = reach[roots]
     scores[tied] = (top + slack * (1.0 + found))[tied]
     return scores
 
 
 @compiled
-def _lead_to_news(graph: GraphArrays, q: Floats, tie: float, gamma: float, max_sweeps: int, news: Floats) -> None:
-    """Fills ``news`` [N, A]: maximum discounted probability of reaching an unexpanded state by policies optimal for ``q``."""
+def _reach_unexpanded(graph: GraphArrays, q: Floats, tie: float, gamma: float, max_sweeps: int, reach: Floats) -> None:
+    """Fills ``reach`` [N, A]: maximum discounted probability of reaching an unexpanded state by policies optimal for ``q``."""
     w = np.where(graph.expanded[: len(q)], 0.0, 1.0)
     active = np.ones(graph.groups[: len(q)].max() + 1, dtype=np.bool_)
     for _ in range(max_sweeps):
@@ -199,15 +199,15 @@ def _lead_to_news(graph: GraphArrays, q: Floats, tie: float, gamma: float, max_s
             g = graph.groups[s]
             if not (active[g] and graph.expanded[s]):
                 continue
-            bar = q[s].max() - tie * max(np.abs(q[s]).max(), 1e-12)
+            threshold = q[s].max() - tie * max(np.abs(q[s]).max(), 1e-12)
             best = 0.0
             for a in range(q.shape[1]):
                 total = 0.0
                 for e in range(graph.first[s, a], graph.first[s, a] + graph.counts[s, a]):
                     if not graph.terminated[e]:
                         total += gamma * graph.probabilities[e] * w[graph.next_nodes[e]]
-                news[s, a] = total
-                if q[s, a] >= bar:
+                reach[s, a] = total
+                if q[s, a] >= threshold:
                     best = max(best, total)
             moved[g] = max(moved[g], abs(best - w[s]))
             w[s] = best
@@ -289,9 +289,9 @@ class SolvedMdp:
         """See the class."""
         graph, complete = grow_reachable(model, start, max_states, n_samples, seed)
         self.graph = graph if complete and len(start) else None
-        more = _affordable(graph, n_samples)
-        if self.graph is not None and more > n_samples:
-            finer, complete = grow_reachable(model, start, max_states, more, seed)
+        n_finer = _affordable(graph, n_samples)
+        if self.graph is not None and n_finer > n_samples:
+            finer, complete = grow_reachable(model, start, max_states, n_finer, seed)
             self.graph = finer if complete else graph
         self.values: Values | None = None
         self.bounds: Floats | None = None
@@ -314,5 +314,5 @@ def _affordable(graph: StateGraph, n_samples: int) -> int:
     """Number of samples for each (state, action) that DRAWS allows for an MDP of this size, if it is stochastic."""
     if n_samples >= MOST_SMALL_SAMPLES or graph.counts.max(initial=0) <= 1:
         return n_samples
-    each = DRAWS // max(graph.counts.size, 1)
-    return max(n_samples, min(MOST_SMALL_SAMPLES, 1 << max(each, 1).bit_length() - 1))
+    n_affordable = DRAWS // max(graph.counts.size, 1)
+    return max(n_samples, min(MOST_SMALL_SAMPLES, 1 << max(n_affordable, 1).bit_length() - 1))

@@ -56,7 +56,7 @@ def test_rewards_that_hang_on_something_else_are_reported() -> None:
     report = LearnedReward((2,) * 4, 3).fit(replace(data, before=states, after=after, rewards=data.rewards + hidden))
     assert report.contrary == pytest.approx(0.3, abs=0.03)
     assert report.advice is not None
-    assert "hangs on what is not observed" in report.advice
+    assert "depends on something unobserved" in report.advice
 
 
 def test_both_zeros_are_one_reward() -> None:
