@@ -60,7 +60,7 @@ class BoltzmannConfig:
 
 
 class ConditionalBoltzmannMachine(BaseTransitionModel):
-    """The model.
+    """A conditional restricted Boltzmann machine as a transition model.
 
     Args:
         cardinalities: number of values of each state factor, length F.

@@ -395,7 +395,7 @@ def reachable_mdp(
     """
     for name, value in (("max_states", max_states), ("n_samples", n_samples), ("the number of start states", len(start))):
         if value < 1:
-            raise ValueError(f"A reachable MDP needs at least one of each, but {name} is {value}; give 1 or more.")
+            raise ValueError(f"A reachable MDP needs a state, a sample and a start state, but {name} is {value}; give 1 or more.")
     graph, complete = grow_reachable(model, start, max_states, n_samples, seed)
     order = np.lexsort((graph.actions, graph.sources))
     counts = graph.counts

@@ -55,8 +55,7 @@ class TabularMDP(ExactModel):
         lengths = {len(next_states), len(terminated), len(probabilities), int(offsets[-1])}
         if rest or len(lengths) > 1 or (np.diff(offsets) < 1).any() or not np.allclose(totals, 1.0):
             raise ValueError(
-                "A table needs outcomes for every (state, action), each with next state, terminated and probability, the latter "
-                "summing to one."
+                "A table needs outcomes for every (state, action), arrays of equal length, and probabilities summing to one."
             )
 
     def start_states(self, n: int, seed: int = 0) -> States:

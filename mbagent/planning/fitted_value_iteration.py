@@ -97,7 +97,7 @@ ITERATIONS = 3
 """Number of rounds, each of simulated play and a fit."""
 
 STATES_A_ROUND = 600
-"""States taken from each round of play."""
+"""Maximum number of states that are taken from each round of play."""
 
 EPISODES = 64
 """Number of episodes simulated in parallel."""
