@@ -1,4 +1,4 @@
-"""What an agent has learned, had back as a Gymnasium environment: any algorithm can be trained in it."""
+"""The learned model as a Gymnasium environment, in which any algorithm can be trained."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ if TYPE_CHECKING:
 
 
 MOST_REWARDS = 100_000
-"""Rewards of so many transitions are remembered."""
+"""Largest number of transitions whose rewards are cached."""
 
 
 class LearnedEnv(gym.Env[Any, Any]):
-    """The world as an agent's model knows it now, with a reward of your choice.
+    """The current state of an agent's model as an environment, with a reward of your choice.
 
-    Next states and terminations are drawn from the model. Episodes start where the agent's did, as often. The spaces are those of
-    the agent's environment. No step of the real environment is taken, so rewards can be tried out, and algorithms
-    compared, in it; what they find is as good as the model.
+    Next states and terminations are sampled from the model. Start states are sampled with the frequencies of the agent's
+    episodes. The spaces are those of the agent's environment. No step of the real environment is taken, so rewards can be tested
+    and algorithms compared in it; the results depend on the accuracy of the model.
 
     Args:
-        agent: one that has learned. It may go on to learn: make another LearnedEnv then.
-        reward_fn: the reward, see RewardFn; None for what the agent plans for now (the environment's own, what it learned from
-            the rewards met, or what ``set_reward`` gave).
-        max_episode_steps: episodes are truncated after so many steps; None for never. Give the real environment's limit, as
-            the model does not know it.
+        agent: an agent that has learned. If it learns further, create a new LearnedEnv.
+        reward_fn: the reward, see RewardFn; None for the agent's current goal (the environment's own reward, one learned from
+            the observed rewards, or the function given to ``set_reward``).
+        max_episode_steps: number of steps after which episodes are truncated; None for no limit. Give the real environment's
+            limit, as it is not part of the model.
 
     Raises:
-        ValueError: the agent has learned nothing yet, or there is no reward; or a limit below 1.
-        TypeError: the agent is none; or the reward is no function of (obs, action, next_obs).
+        ValueError: the agent has learned nothing yet, there is no reward, or the limit is below 1.
+        TypeError: ``agent`` is not an agent, or the reward is not a function of (obs, action, next_obs).
 
     Example:
         agent = mbagent.ModelLearningAgent("MctsPolicy", env, seed=0).learn(20_000)
-        imagined = mbagent.LearnedEnv(agent, lambda obs, action, next_obs: next_obs[:, 9], max_episode_steps=100)
-        PPO("MlpPolicy", imagined).learn(100_000)
+        learned_env = mbagent.LearnedEnv(agent, lambda obs, action, next_obs: next_obs[:, 9], max_episode_steps=100)
+        PPO("MlpPolicy", learned_env).learn(100_000)
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own form
@@ -60,7 +60,7 @@ class LearnedEnv(gym.Env[Any, Any]):
     def _take(self, agent: ModelLearningAgent, reward_fn: RewardFn | None, max_episode_steps: int | None) -> None:
         policy = agent.policy
         if not policy.fitted:
-            raise ValueError("This agent has learned nothing yet, so there is no world to have back; call learn() first.")
+            raise ValueError("This agent has learned nothing yet, so there is no model to use as an environment; call learn() first.")
         max_episode_steps = check_count("max_episode_steps", max_episode_steps, "no limit")
         if reward_fn is None and policy.goal is None:
             raise ValueError(NO_GOAL)
@@ -77,7 +77,7 @@ class LearnedEnv(gym.Env[Any, Any]):
         """See gymnasium.Env.
 
         Raises:
-            ValueError: options are given; there are none.
+            ValueError: options are given; none are supported.
         """
         super().reset(seed=seed)
         if options:
@@ -106,7 +106,7 @@ class LearnedEnv(gym.Env[Any, Any]):
         return self._shown(following), reward, terminated, truncated, {}
 
     def _earned(self, states: States, actions: Actions, following: States) -> float:
-        """The reward of a transition; it is asked for once, as learned rewards and users' functions are quick in batches only."""
+        """The reward of a transition; cached, since learned rewards and users' functions are fast only on batches."""
         key = states.tobytes() + actions.tobytes() + following.tobytes()
         if (known := self._rewards.get(key)) is not None:
             return known
@@ -121,7 +121,7 @@ class LearnedEnv(gym.Env[Any, Any]):
 
 
 def _starts(agent: ModelLearningAgent) -> tuple[States, NDArray[np.float64]]:
-    """Start states [S, F], and the share of episodes that began in each; equal shares where the episodes are not at hand."""
+    """Start states [S, F], and the share of episodes that began in each; equal shares if no transitions are available."""
     rows = agent.transitions.rows()
     _, first = np.unique(rows.episodes, return_index=True)
     begun = rows.before[first].astype(np.int64)
@@ -131,7 +131,7 @@ def _starts(agent: ModelLearningAgent) -> tuple[States, NDArray[np.float64]]:
 
 
 def _first(batch: Any) -> Any:
-    """The observation of a batch of one, laid out as ``batch_space`` does."""
+    """The observation of a batch of one in the form of ``batch_space``."""
     if isinstance(batch, dict):
         return {key: _first(part) for key, part in batch.items()}
     if isinstance(batch, tuple):
