@@ -60,7 +60,9 @@ class LearnedEnv(gym.Env[Any, Any]):
     def _take(self, agent: ModelLearningAgent, reward_fn: RewardFn | None, max_episode_steps: int | None) -> None:
         policy = agent.policy
         if not policy.fitted:
-            raise ValueError("This agent has learned nothing yet, so there is no model to use as an environment; call learn() first.")
+            raise ValueError(
+                "This agent has learned nothing yet, so there is no model to use as an environment; call learn() first."
+            )
         max_episode_steps = check_count("max_episode_steps", max_episode_steps, "no limit")
         if reward_fn is None and policy.goal is None:
             raise ValueError(NO_GOAL)

@@ -79,7 +79,9 @@ class PlannerPolicy(BasePolicy):
                 raise ValueError("forecasts='direct' is for the FlatMonteCarloPolicy; other planners plan step by step.")
             direct_model(model)
         if settings.time_budget is not None and self.planner_class is ValueIterationPlanner:
-            raise ValueError("time_budget is for policies that simulate; the ValueIterationPolicy is limited by lookahead_states.")
+            raise ValueError(
+                "time_budget is for policies that simulate; the ValueIterationPolicy is limited by lookahead_states."
+            )
         if settings.reuse_tree and not issubclass(self.planner_class, MctsPlanner):
             raise ValueError("reuse_tree is for the MctsPolicy; other planners keep no tree.")
         self.planner: Planner = self.planner_class(settings)

@@ -97,7 +97,7 @@ def test_cells_of_a_plane_share_their_values() -> None:
 def test_numbers_that_cannot_be_told_apart_are_refused() -> None:
     space = FactoredSpace(spaces.Box(-(2**63), 2**63 - 1, (1,), dtype=np.int64))
     assert space.decode(space.encode(np.array([[2**61 - 1], [-(2**61)]])))[:, 0].tolist() == [2**61 - 1, -(2**61)]
-    with pytest.raises(ValueError, match="told apart"):
+    with pytest.raises(ValueError, match=r"to 2\^61 are supported"):
         space.encode(np.array([[2**62]]))
 
 

@@ -180,7 +180,7 @@ def test_actions_before_the_first_fit_are_valid_random_and_seeded() -> None:
 
 def test_rewards_that_the_environments_own_function_does_not_give_are_learned() -> None:
     env = gym.wrappers.TransformReward(gym.make("mbagent/GeyserRunner-v0"), lambda reward: -float(reward))
-    with pytest.warns(UserWarning, match=r"reward_fn differs from \d+ of the 1000 rewards met"):
+    with pytest.warns(UserWarning, match=r"reward_fn differs from \d+ of the 1000 rewards observed"):
         agent = ModelLearningAgent("MctsPolicy", env, seed=0).learn(1000, log_interval=None)
     assert agent.goals.source == "learned"
 
