@@ -29,7 +29,7 @@ from mbagent_envs.random_keys import hash_rows
 _COLUMNS = ("states", "actions", "next_states", "terminated", "rewards", "episodes")
 _KEPT = ("before", "actions", "after", "terminated", "rewards", "episodes")
 
-_ABOUT = "dataset.json"
+_DESCRIPTION = "dataset.json"
 
 _MAPPED = 1_000_000
 """Smallest size in bytes at which a selection of rows of a mapped array is itself stored in a mapped file."""
@@ -76,7 +76,7 @@ class TransitionBatch:
 
     def select(self, rows: NDArray[Any] | slice) -> TransitionBatch:
         """The rows with the given indices or mask, in the same types; large selections of mapped arrays are mapped as well."""
-        return TransitionBatch(*(_taken(getattr(self, name), rows) for name in _KEPT))
+        return TransitionBatch(*(_selected(getattr(self, name), rows) for name in _KEPT))
 
     def narrowed(self, kind: np.dtype[Any]) -> TransitionBatch:
         """The same rows with states of another integer type."""
@@ -112,7 +112,7 @@ class TransitionDataset:
         """Creates the folder, or opens the existing one."""
         self.cardinalities = tuple(int(c) for c in self.cardinalities)
         if self.folder is not None:
-            self._chunks = [_begun(Path(self.folder), self.cardinalities, self.n_actions, self.kind)]
+            self._chunks = [_open_folder(Path(self.folder), self.cardinalities, self.n_actions, self.kind)]
         self._lock = Lock()  # rows that one thread appends while another merges chunks must not be lost
 
     @property
@@ -268,7 +268,7 @@ class TransitionDataset:
             ValueError: the file or the folder does not contain such a table.
         """
         if path and isinstance(path, str | os.PathLike) and Path(path).is_dir() and not Path(f"{os.fspath(path)}.npz").is_file():
-            about = _about(Path(path))
+            about = _read_description(Path(path))
             return cls(tuple(about["cardinalities"]), about["n_actions"], path)
         cardinalities, n_actions, rows = _table(path)
         data = cls(cardinalities, n_actions)
@@ -276,7 +276,7 @@ class TransitionDataset:
         return data
 
 
-def _taken(values: NDArray[Any], rows: NDArray[Any] | slice) -> NDArray[Any]:
+def _selected(values: NDArray[Any], rows: NDArray[Any] | slice) -> NDArray[Any]:
     """The selected rows; a large selection of a mapped array is mapped to a temporary file."""
     if not isinstance(values, np.memmap) or isinstance(rows, slice):
         return values[rows]
@@ -307,31 +307,31 @@ def _table(source: files.Target) -> tuple[tuple[int, ...], int, TransitionBatch]
             raise ValueError(f"{label} is no table of transitions that save_transitions wrote: {error}.") from error
 
 
-def _about(folder: Path) -> dict[str, Any]:
+def _read_description(folder: Path) -> dict[str, Any]:
     """The description of a dataset's folder; ``rows`` is None for folders of versions that did not store it."""
     try:
-        about = json.loads((folder / _ABOUT).read_text(encoding="utf-8"))
+        about = json.loads((folder / _DESCRIPTION).read_text(encoding="utf-8"))
         kept = {"cardinalities": [int(c) for c in about["cardinalities"]], "n_actions": int(about["n_actions"])}
         return {**kept, "rows": None if about.get("rows") is None else int(about["rows"])}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{folder} is no folder of transitions: its {_ABOUT} cannot be read ({error}).") from error
+        raise ValueError(f"{folder} is no folder of transitions: its {_DESCRIPTION} cannot be read ({error}).") from error
 
 
-def _begun(folder: Path, cardinalities: tuple[int, ...], n_actions: int, kind: np.dtype[Any]) -> TransitionBatch:
+def _open_folder(folder: Path, cardinalities: tuple[int, ...], n_actions: int, kind: np.dtype[Any]) -> TransitionBatch:
     """A folder's rows; creates the folder if it does not exist."""
     about = {"cardinalities": list(cardinalities), "n_actions": n_actions}
     if folder.is_file() or not cardinalities:
         raise ValueError(
             f"{folder} cannot hold transitions of {len(cardinalities)} factors; give a folder, and at least one factor."
         )
-    if not (folder / _ABOUT).exists():
+    if not (folder / _DESCRIPTION).exists():
         Path(os.path.realpath(folder)).mkdir(parents=True, exist_ok=True)  # also for a link whose target does not exist yet
         for name in _COLUMNS:
             (folder / f"{name}.bin").touch()
         with _locked(folder):
-            if not (folder / _ABOUT).exists():  # another process may have created it in the meantime, and even written rows
-                files.write(folder / _ABOUT, json.dumps({**about, "rows": _whole_rows(folder, len(cardinalities), kind)}))
-    if {**_about(folder), "rows": None} != {**about, "rows": None}:
+            if not (folder / _DESCRIPTION).exists():  # another process may have created it in the meantime, and even written rows
+                files.write(folder / _DESCRIPTION, json.dumps({**about, "rows": _whole_rows(folder, len(cardinalities), kind)}))
+    if {**_read_description(folder), "rows": None} != {**about, "rows": None}:
         raise ValueError(f"{folder} holds transitions of another environment; choose another folder.")
     return _mapped(folder, len(cardinalities), kind)
 
@@ -354,12 +354,12 @@ def _whole_rows(folder: Path, n_factors: int, kind: np.dtype[Any]) -> int:
 
 def _mapped(folder: Path, n_factors: int, kind: np.dtype[Any]) -> TransitionBatch:
     """The completely written rows, mapped; rows of an interrupted write are ignored."""
-    types, columns, written = _types(kind), [], _about(folder)["rows"]
+    types, columns, written = _types(kind), [], _read_description(folder)["rows"]
     n = _whole_rows(folder, n_factors, kind)
     if written is not None and n < written:
         raise ValueError(
             f"{folder} is damaged: a column holds only {n} of the {written} rows written; restore its files from a copy, or set "
-            f"rows to {n} in its {_ABOUT} to go on with those."
+            f"rows to {n} in its {_DESCRIPTION} to go on with those."
         )
     n = n if written is None else written
     for name in _COLUMNS:
@@ -381,7 +381,7 @@ def _write(folder: Path, batch: TransitionBatch, n_before: int) -> None:
             file.write(values.data)
             file.flush()
             os.fsync(file.fileno())
-    files.write(folder / _ABOUT, json.dumps({**_about(folder), "rows": n_before + len(batch)}))
+    files.write(folder / _DESCRIPTION, json.dumps({**_read_description(folder), "rows": n_before + len(batch)}))
 
 
 def _locked(folder: Path) -> AbstractContextManager[None]:

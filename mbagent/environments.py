@@ -79,29 +79,29 @@ class Guarded(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
         Raises:
             TypeError, ValueError: the environment returned values of the wrong type, number or range.
         """
-        obs, info = self._parts(self.env.reset(seed=seed, options=options), "reset", "(observation, info)", 2)
-        return self._own(obs), self._copied(info)
+        obs, info = self._checked_tuple(self.env.reset(seed=seed, options=options), "reset", "(observation, info)", 2)
+        return self._checked_copy(obs), self._copied(info)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """See gymnasium.Env; raises as ``reset``."""
         names = "(observation, reward, terminated, truncated, info)"
-        obs, reward, terminated, truncated, info = self._parts(self.env.step(action), "step", names, 5)
+        obs, reward, terminated, truncated, info = self._checked_tuple(self.env.step(action), "step", names, 5)
         try:
             float(reward)
         except (TypeError, ValueError) as error:
             raise TypeError(
                 f"The environment's step returned the reward {reward!r} instead of one number; fix the environment."
             ) from error
-        return self._own(obs), reward, terminated, truncated, self._copied(info)
+        return self._checked_copy(obs), reward, terminated, truncated, self._copied(info)
 
     @staticmethod
-    def _parts(returned: Any, method: str, names: str, n: int) -> tuple[Any, ...]:
+    def _checked_tuple(returned: Any, method: str, names: str, n: int) -> tuple[Any, ...]:
         if isinstance(returned, tuple) and len(returned) == n:
             return returned
         got = f"{len(returned)} values" if isinstance(returned, tuple) else repr(returned)
         raise TypeError(f"The environment's {method} returned {got} instead of Gymnasium's {names}; fix the environment.")
 
-    def _own(self, obs: Any) -> Any:
+    def _checked_copy(self, obs: Any) -> Any:
         space = self._space.space
         if isinstance(obs, list) or not space.contains(obs):  # the space's own check is fast, but rejects other data types
             with blaming_environment():

@@ -125,10 +125,10 @@ class Explanation:
             lines.append(f"{names[a]:>{width}}{figures}{'  <- taken' if a == self.best else ''}")
         for a in rows:
             lines.append(f"likeliest futures of action {names[a]}:")
-            lines += [f"  {future.probability:6.1%}  {_described(future)}" for future in self.futures[a]]
+            lines += [f"  {future.probability:6.1%}  {_as_text(future)}" for future in self.futures[a]]
             for step, effect in zip(self.rare[a], self.effects[a], strict=True):
                 lines.append(
-                    f"  {step.probability:6.2g}  {_described(Future((step,), step.probability))}: rare, {effect:+.3g} in value"
+                    f"  {step.probability:6.2g}  {_as_text(Future((step,), step.probability))}: rare, {effect:+.3g} in value"
                 )
         return "\n".join(lines)
 
@@ -144,10 +144,10 @@ def explain(policy: PlannerPolicy, observation: Any, n_futures: int = 3, n_steps
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
             raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")
     with policy.lock.planning():
-        return _explained(policy, observation, n_futures, n_steps)
+        return _explanation(policy, observation, n_futures, n_steps)
 
 
-def _explained(policy: PlannerPolicy, observation: Any, n_futures: int, n_steps: int) -> Explanation:
+def _explanation(policy: PlannerPolicy, observation: Any, n_futures: int, n_steps: int) -> Explanation:
     state = _single_state(policy, observation)
     # A time budget or the last decision's tree would make explanations irreproducible.
     settings = replace(policy.settings, time_budget=None, reuse_tree=False)
@@ -262,7 +262,7 @@ def _row(batch: Any, index: int) -> Any:
     return batch[index]
 
 
-def _described(future: Future) -> str:
+def _as_text(future: Future) -> str:
     """A future as a line of text: actions, short observations, non-zero rewards, termination."""
     parts = []
     for step in future.steps:

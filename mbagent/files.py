@@ -122,20 +122,20 @@ def replaced(path: Path) -> Iterator[BinaryIO]:
         OSError: any other failure, such as a full disk.
     """
     path = Path(os.path.realpath(path))
-    before = _before(path)
+    before = _prepare(path)
     _remove_abandoned(path)
-    with _explained(path):
-        temporary, file = _begun(path)
+    with _explain_permissions(path):
+        temporary, file = _create_temporary(path)
     try:
         with file:
             yield file
             if before is not None:
-                _like(temporary, before)
+                _copy_permissions(temporary, before)
             file.flush()
             os.fsync(file.fileno())
             if sys.platform == "win32":  # cannot rename open files; elsewhere the file stays open, hence locked, until then
                 file.close()
-            with _explained(path):
+            with _explain_permissions(path):
                 temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
@@ -143,10 +143,10 @@ def replaced(path: Path) -> Iterator[BinaryIO]:
     _sync(path.parent)
 
 
-def _before(path: Path) -> os.stat_result | None:
+def _prepare(path: Path) -> os.stat_result | None:
     """Status of the file to be replaced; None if there is none. Creates the folder."""
     try:
-        with _explained(path):
+        with _explain_permissions(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             before = path.stat()
     except FileNotFoundError:
@@ -163,7 +163,7 @@ def _before(path: Path) -> os.stat_result | None:
 
 
 @contextmanager
-def _explained(path: Path) -> Iterator[None]:
+def _explain_permissions(path: Path) -> Iterator[None]:
     """Explains why a file that may itself be writable cannot be replaced."""
     try:
         yield
@@ -176,7 +176,7 @@ def _explained(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _begun(path: Path) -> tuple[Path, BinaryIO]:
+def _create_temporary(path: Path) -> tuple[Path, BinaryIO]:
     """A new, locked file with a unique name in the folder of ``path``, with the default permissions of new files."""
     while True:
         temporary = path.with_name(f"{_prefix(path)}{uuid.uuid4().hex}.part")
@@ -223,7 +223,7 @@ def locked(path: Path) -> Iterator[None]:
         yield
 
 
-def _like(path: Path, before: os.stat_result) -> None:
+def _copy_permissions(path: Path, before: os.stat_result) -> None:
     """Gives a file the permissions of another and, if allowed, its owner."""
     if sys.platform != "win32":
         with suppress(OSError):

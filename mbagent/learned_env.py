@@ -55,9 +55,9 @@ class LearnedEnv(gym.Env[Any, Any]):
         if not isinstance(getattr(agent, "policy", None), PlannerPolicy):
             raise TypeError(f"LearnedEnv needs an agent, a ModelLearningAgent that has learned, got {agent!r}.")
         with agent.policy.lock:
-            self._take(agent, reward_fn, max_episode_steps)
+            self._set_up(agent, reward_fn, max_episode_steps)
 
-    def _take(self, agent: ModelLearningAgent, reward_fn: RewardFn | None, max_episode_steps: int | None) -> None:
+    def _set_up(self, agent: ModelLearningAgent, reward_fn: RewardFn | None, max_episode_steps: int | None) -> None:
         policy = agent.policy
         if not policy.fitted:
             raise ValueError(
@@ -86,7 +86,7 @@ class LearnedEnv(gym.Env[Any, Any]):
             raise ValueError(f"LearnedEnv takes no reset options, got {sorted(options)[0]!r}.")
         row = int(self.np_random.choice(len(self._starts), p=self._shares))
         self._state, self._steps = self._starts[row : row + 1], 0
-        return self._shown(self._state), {}
+        return self._observation(self._state), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """See gymnasium.Env.
@@ -101,13 +101,13 @@ class LearnedEnv(gym.Env[Any, Any]):
         if len(actions) != 1:
             raise ValueError(f"LearnedEnv.step takes one action, got a batch of {len(actions)}.")
         following, over = self.model.sample(self._state, actions, self.np_random.integers(2**64, size=1, dtype=np.uint64))
-        reward = self._earned(self._state, actions, following)
+        reward = self._reward_of(self._state, actions, following)
         self._state, self._steps = following, self._steps + 1
         terminated = bool(over[0])
         truncated = not terminated and self.max_episode_steps is not None and self._steps >= self.max_episode_steps
-        return self._shown(following), reward, terminated, truncated, {}
+        return self._observation(following), reward, terminated, truncated, {}
 
-    def _earned(self, states: States, actions: Actions, following: States) -> float:
+    def _reward_of(self, states: States, actions: Actions, following: States) -> float:
         """The reward of a transition; cached, since learned rewards and users' functions are fast only on batches."""
         key = states.tobytes() + actions.tobytes() + following.tobytes()
         if (known := self._rewards.get(key)) is not None:
@@ -118,7 +118,7 @@ class LearnedEnv(gym.Env[Any, Any]):
         reward = self._rewards[key] = float(self._reward(states, actions, following)[0])
         return reward
 
-    def _shown(self, state: States) -> Any:
+    def _observation(self, state: States) -> Any:
         return _first(self._space.decode(state))
 
 

@@ -119,7 +119,7 @@ class CallableReward:
 
 Source = Literal["custom", "environment", "learned", "missing"]
 
-_PROBE_ROWS = 64
+_TEST_ROWS = 64
 
 
 def reward_wrapper(env: VecEnv) -> str | None:
@@ -168,7 +168,7 @@ class RewardSelector:
         fn, self._unusable = own_reward(env)
         if fn is not None:
             try:
-                self._environment = self._given(fn)
+                self._environment = self._as_goal(fn)
             except TypeError as error:  # an attribute of that name that is not a reward function
                 self._unusable = f"The environment's reward_fn cannot be used as a goal ({str(error).rstrip('.')})"
         self._changes_rewards, self._last_warning = reward_wrapper(env), None
@@ -180,7 +180,7 @@ class RewardSelector:
     def recode(self) -> None:
         """Updates the rewards after a change of the policy's factors."""
         self._custom, self._environment = (
-            None if given is None else self._given(given.fn) for given in (self._custom, self._environment)
+            None if given is None else self._as_goal(given.fn) for given in (self._custom, self._environment)
         )
         self.learned = False
 
@@ -196,8 +196,8 @@ class RewardSelector:
         """
         custom = None
         if reward is not None:
-            custom = self._given(reward)
-            self._probe(custom)
+            custom = self._as_goal(reward)
+            self._test(custom)
         self._custom = custom
         self.source = "custom" if custom is not None else "environment"
         return self.current()
@@ -276,11 +276,11 @@ class RewardSelector:
             return f"The environment's reward_fn differs from {int(wrong.sum())} of the {len(rows)} rewards observed"
         return None
 
-    def _probe(self, reward: CallableReward) -> None:
+    def _test(self, reward: CallableReward) -> None:
         """Tests a reward function on observed transitions, or else on start states or the space's first observation."""
         rows = self._transitions.rows()
         if len(rows):
-            picked = rows.select(np.linspace(0, len(rows) - 1, min(_PROBE_ROWS, len(rows))).astype(np.int64))
+            picked = rows.select(np.linspace(0, len(rows) - 1, min(_TEST_ROWS, len(rows))).astype(np.int64))
             reward(picked.states, picked.actions, picked.next_states)
             return
         states = np.zeros((3, len(self._policy.factored)), dtype=np.int64)
@@ -288,5 +288,5 @@ class RewardSelector:
             states = self._policy.start_states[np.arange(3) % len(self._policy.start_states)]
         reward(states, np.zeros(3, dtype=np.int64), states)
 
-    def _given(self, fn: RewardFn) -> CallableReward:
+    def _as_goal(self, fn: RewardFn) -> CallableReward:
         return CallableReward(fn, self._policy.factored, self._policy.actions)

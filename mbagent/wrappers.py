@@ -63,20 +63,20 @@ class History(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
         obs, info = self.env.reset(seed=seed, options=options)
         self._now = self._factors(obs)
         self._past.extend([(self._now, -1)] * self.k)
-        return self._shown(), info
+        return self._with_history(), info
 
     def step(self, action: Any) -> tuple[NDArray[np.int64], Any, bool, bool, dict[str, Any]]:
         """See gymnasium.Env."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         self._past.appendleft((self._now, int(self._actions.encode(_batch(action))[0])))
         self._now = self._factors(obs)
-        return self._shown(), reward, terminated, truncated, info
+        return self._with_history(), reward, terminated, truncated, info
 
     def _factors(self, obs: Any) -> NDArray[np.int64]:
         factors: NDArray[np.int64] = self._space.encode(_batch(obs))[0]
         return factors
 
-    def _shown(self) -> NDArray[np.int64]:
+    def _with_history(self) -> NDArray[np.int64]:
         """The observation with its past, newest first."""
         planes = self._planes
         parts = []

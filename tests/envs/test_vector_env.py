@@ -118,7 +118,7 @@ def test_copies_may_start_from_given_states(env_id: str) -> None:
         own.reset(options={"state": states[:2]})
     with pytest.raises(ValueError, match="not a state of"):
         own.reset(options={"state": np.zeros_like(states)})
-    with pytest.raises(ValueError, match="reset knows no option 'bogus'; its options are 'state', 'reset_mask'"):
+    with pytest.raises(ValueError, match="reset has no option 'bogus'; its options are 'state', 'reset_mask'"):
         own.reset(options={"bogus": 1})
     with pytest.raises(ValueError, match="reset_mask"):
         own.reset(options={"reset_mask": np.zeros(3, dtype=np.bool_)})
