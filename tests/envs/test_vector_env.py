@@ -67,7 +67,7 @@ def test_the_default_is_next_step_and_the_games_own_length() -> None:
     assert own.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     own.reset(seed=0)
     ends = [own.step(np.zeros(2, dtype=np.int64))[3].tolist() for _ in range(202)]
-    assert [t + 1 for t, end in enumerate(ends) if end[0]] == [100, 201]  # one call of each 101 is the reset
+    assert [t + 1 for t, end in enumerate(ends) if end[0]] == [100, 201]  # one call of every 101 is the reset
     endless = gym.make_vec("mbagent/Maneuverer-v0", num_envs=2, max_episode_steps=-1)
     endless.reset(seed=0)
     assert not any(endless.step(np.zeros(2, dtype=np.int64))[3].any() for _ in range(150))

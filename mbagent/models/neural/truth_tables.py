@@ -357,7 +357,7 @@ def rules_work(k: BitRules, n_grid: int) -> RulesWork:
 
 @inlined
 def _by_outcome(q: int, place: int, weight: int, v: int, end: int, parents: Ints, base: Ints, slot: Ints, factors: Ints) -> int:
-    """Adds the values of parents ``v`` to ``end`` in the outcome of particle q to the index ``place``; ``weight`` is the stride."""
+    """Adds the parents ``v`` to ``end``, with the values of particle q, to the index ``place``, starting at stride ``weight``."""
     while v < end:
         value = base[parents[v]]
         if value < 0:
