@@ -284,7 +284,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
         check_callback(callback)
         check_progress(progress_bar)
         if not steps and not len(self.experience.dataset):
-            raise ValueError("learn(0) only fits the transitions collected so far, and there are none; ask for steps.")
+            raise ValueError("learn(0) only fits the transitions collected so far, and there are none; give a number of steps.")
         total, callbacks = self._setup_learn(steps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if self._recorder is None or (fresh_start and self._last_obs is not None):
             self._recorder = ExperienceRecorder(self.experience.space, self.experience.dataset, self.n_envs)
@@ -552,8 +552,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
             **kwargs: constructor arguments that override the saved ones.
 
         Raises:
-            FileNotFoundError, TypeError, ValueError: the file does not exist, ``path`` is not a path, or the file is not a saved
-                agent.
+            FileNotFoundError, TypeError, ValueError: there is no such file, ``path`` is not a path, or not a saved agent.
         """
         del custom_objects
         if print_system_info:

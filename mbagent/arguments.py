@@ -30,7 +30,7 @@ def fitting_model(model: TransitionModel, space: FactoredSpace, n_actions: int) 
     if tuple(model.cardinalities) != space.cardinalities or model.n_actions != n_actions:
         raise ValueError(
             f"The model has {len(model.cardinalities)} factors and {model.n_actions} actions, but the environment "
-            f"{len(space)} and {n_actions}; build the model for this environment's spaces."
+            f"has {len(space)} and {n_actions}; build the model for this environment's spaces."
         )
     return model
 
@@ -93,7 +93,7 @@ def check_device(device: Any) -> torch.device | str:
         return "cpu" if device == "auto" else torch.device(device)
     except (RuntimeError, TypeError) as error:
         raise ValueError(
-            f"device must be 'auto', 'cpu' or another device that torch knows, such as 'cuda', got {device!r}."
+            f"device must be 'auto', 'cpu' or another device that torch supports, such as 'cuda', got {device!r}."
         ) from error
 
 
@@ -152,5 +152,5 @@ def policy_name(policy_class: type[BasePolicy], aliases: Mapping[str, type[BaseP
         if known is policy_class:
             return name
     raise ValueError(
-        f"The policy {policy_class.__name__} has no name that a file could hold; add it to ModelLearningAgent.policy_aliases."
+        f"The policy {policy_class.__name__} has no name for saving; add it to ModelLearningAgent.policy_aliases."
     )

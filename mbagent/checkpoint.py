@@ -137,7 +137,7 @@ class AgentState:
         if not missing and "start_states" not in self.arrays["planning"]:
             missing = ["planning.npz: start_states"]
         if missing:
-            raise ValueError(f"The file is no complete saved agent: it lacks {', '.join(missing)}.")
+            raise ValueError(f"The file is not a complete saved agent: it lacks {', '.join(missing)}.")
         if not isinstance(self.data["settings"], dict) or self.data["reward_source"] not in get_args(Source):
             raise ValueError("The file is damaged: its settings or its reward source cannot be read.")
 
@@ -211,7 +211,7 @@ def read(source: Target) -> AgentState:
                 raise ValueError(f"{label} was not saved by ModelLearningAgent; load it with the program that saved it.")
             arrays = {Path(name).stem: _arrays(archive, name, label) for name in names if name.endswith(".npz")}
     except (zipfile.BadZipFile, json.JSONDecodeError, UnicodeDecodeError, KeyError, NotImplementedError, zlib.error) as error:
-        raise ValueError(f"{label} is no saved agent, or is damaged: {error}.") from error
+        raise ValueError(f"{label} is not a saved agent, or is damaged: {error}.") from error
     return AgentState(data, arrays)
 
 
@@ -219,12 +219,12 @@ def refuse_serialized(data: Any, names: list[str]) -> None:
     """Raises ValueError, naming the entry, if the file contains pickled objects, which would run code when read."""
     for name in names:
         if name.endswith((".pth", ".pt", ".pkl", ".pickle")):
-            raise ValueError(f"The file's entry {name!r} is a pickle, which runs code when read; mbagent files hold none.")
+            raise ValueError(f"The file's entry {name!r} is a pickle, which runs code when read; mbagent files contain none.")
     if not isinstance(data, dict):
-        raise ValueError("The file's entry 'data' is no JSON object; it was not saved by an mbagent agent.")
+        raise ValueError("The file's entry 'data' is not a JSON object; it was not saved by an mbagent agent.")
     for key, value in data.items():
         if isinstance(value, dict) and ":serialized:" in value:
-            raise ValueError(f"The file's entry {key!r} is serialized code; mbagent files hold none, so it is refused.")
+            raise ValueError(f"The file's entry {key!r} is serialized code; mbagent files contain none, so it is refused.")
 
 
 def _arrays(archive: zipfile.ZipFile, name: str, label: Any) -> dict[str, NDArray[Any]]:

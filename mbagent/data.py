@@ -146,7 +146,7 @@ class TransitionDataset:
             folder, n_factors = Path(self.folder), len(self.cardinalities)
             with _locked(folder):
                 if len(_mapped(folder, n_factors, self.kind)) != len(self):
-                    raise ValueError(f"Another dataset has written to {folder} since this one read it; load it anew.")
+                    raise ValueError(f"Another dataset has written to {folder} since this one read it; load it again.")
                 _write(folder, narrow, len(self))
             self._chunks = [_mapped(folder, n_factors, self.kind)]
 
@@ -304,7 +304,7 @@ def _table(source: files.Target) -> tuple[tuple[int, ...], int, TransitionBatch]
             columns: Any = (table[name].astype(np.int64) if name in ("actions", "episodes") else table[name] for name in _COLUMNS)
             return tuple(int(c) for c in table["cardinalities"]), int(table["n_actions"]), TransitionBatch(*columns)
         except (ValueError, TypeError) as error:
-            raise ValueError(f"{label} is no table of transitions that save_transitions wrote: {error}.") from error
+            raise ValueError(f"{label} is not a table of transitions written by save_transitions: {error}.") from error
 
 
 def _read_description(folder: Path) -> dict[str, Any]:
@@ -314,7 +314,7 @@ def _read_description(folder: Path) -> dict[str, Any]:
         kept = {"cardinalities": [int(c) for c in about["cardinalities"]], "n_actions": int(about["n_actions"])}
         return {**kept, "rows": None if about.get("rows") is None else int(about["rows"])}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{folder} is no folder of transitions: its {_DESCRIPTION} cannot be read ({error}).") from error
+        raise ValueError(f"{folder} is not a folder of transitions: its {_DESCRIPTION} cannot be read ({error}).") from error
 
 
 def _open_folder(folder: Path, cardinalities: tuple[int, ...], n_actions: int, kind: np.dtype[Any]) -> TransitionBatch:
@@ -348,7 +348,7 @@ def _whole_rows(folder: Path, n_factors: int, kind: np.dtype[Any]) -> int:
     width = {name: n_factors if name in ("states", "next_states") else 1 for name in _COLUMNS}
     missing = [name for name in _COLUMNS if not (folder / f"{name}.bin").exists()]
     if missing:
-        raise ValueError(f"{folder} is no folder of transitions: it lacks {missing[0]}.bin.")
+        raise ValueError(f"{folder} is not a folder of transitions: it lacks {missing[0]}.bin.")
     return min((folder / f"{name}.bin").stat().st_size // max(1, width[name] * types[name].itemsize) for name in _COLUMNS)
 
 

@@ -90,7 +90,7 @@ def arrays(file: BinaryIO) -> dict[str, NDArray[Any]]:
         with np.load(file, allow_pickle=False) as archive:
             return {name: np.asarray(archive[name]) for name in archive.files}
     except (ValueError, EOFError, TypeError, AttributeError, KeyError, zipfile.BadZipFile, zlib.error):
-        raise ValueError("it is no .npz of plain arrays or is damaged") from None
+        raise ValueError("it is not an .npz of plain arrays, or is damaged") from None
 
 
 def _is_open(target: Any, method: str) -> TypeGuard[BinaryIO]:

@@ -210,7 +210,7 @@ class PlannerPolicy(BasePolicy):
             raise ValueError(f"There is no parameter called {unknown[0]!r}; take names from get_parameters()['policy'].")
         for name, value in arrays.items():
             if value.dtype.kind == "f" and not np.isfinite(value).all():
-                raise ValueError(f"The parameter {name!r} holds NaN or infinity; take weights from a sound agent.")
+                raise ValueError(f"The parameter {name!r} holds NaN or infinity; take weights from an intact agent.")
         before, reward = self.transition_model.state_dict(), _part(arrays, "reward.")
         self.transition_model.load_state_dict(_part(arrays, "model."))
         try:

@@ -91,7 +91,7 @@ def test_folders_of_another_environment_are_refused(tmp_path: Path) -> None:
     TransitionDataset(CARDINALITIES, 4, tmp_path)
     with pytest.raises(ValueError, match="another environment"):
         TransitionDataset((2, 2), 4, tmp_path)
-    with pytest.raises(ValueError, match="no folder of transitions"):
+    with pytest.raises(ValueError, match="not a folder of transitions"):
         TransitionDataset.load(tmp_path / "..")
 
 
@@ -119,7 +119,7 @@ def test_two_datasets_do_not_overwrite_each_other(tmp_path: Path) -> None:
     one, other = (TransitionDataset(CARDINALITIES, 4, folder=tmp_path / "rows") for _ in range(2))
     one.append(batch(20))
     seen = one.rows().states.copy()
-    with pytest.raises(ValueError, match="load it anew"):
+    with pytest.raises(ValueError, match="load it again"):
         other.append(batch(2, 1))
     one.append(batch(2, 1))
     assert np.array_equal(one.rows().states[:20], seen)

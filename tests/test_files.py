@@ -322,7 +322,7 @@ def test_files_that_are_no_table_raise_an_error_without_advice_to_read_pickles(t
     np.savez(tmp_path / "pickled.npz", **{**table, "rewards": np.array([{}])}, allow_pickle=True)
     (tmp_path / "rows.npz").unlink()
     for path in sorted(tmp_path.iterdir()):
-        with pytest.raises(ValueError, match=r"is no table of transitions that save_transitions wrote") as caught:
+        with pytest.raises(ValueError, match=r"is not a table of transitions written by save_transitions") as caught:
             TransitionDataset.load(path)
         assert path.name in str(caught.value)
         assert "allow_pickle" not in str(caught.value)

@@ -208,8 +208,8 @@ class Maneuverer(Game):
         return as_floats(next_obs[:, 0, 0, 0])
 
     def _next_to(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
-        beside = _sides(next_obs[:, 2], edge=0).any(axis=0)
-        return as_floats((next_obs[:, 0] & beside).any(axis=(1, 2)))
+        adjacent = _sides(next_obs[:, 2], edge=0).any(axis=0)
+        return as_floats((next_obs[:, 0] & adjacent).any(axis=(1, 2)))
 
     def _moving(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
         return as_floats((obs[:, 0] != next_obs[:, 0]).any(axis=(1, 2)))
