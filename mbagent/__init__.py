@@ -1,4 +1,4 @@
-"""mbagent: an agent that learns how a stochastic discrete world works, and can then be given any goal.
+"""mbagent: an agent that learns a model of a stochastic discrete environment and can then plan for any reward function.
 
 Importing this package registers the games ``mbagent/GeyserRunner-v0``, ``mbagent/Maneuverer-v0`` and
 ``mbagent/FlierCatcher-v0`` with Gymnasium.

@@ -1,4 +1,4 @@
-"""The agent: it explores, fits a transition model to what it observed, and plans."""
+"""The agent: explores, fits a transition model to the observed transitions, and plans."""
 
 from __future__ import annotations
 
@@ -49,49 +49,49 @@ from mbagent.spaces import ActionEnumeration, FactoredSpace
 from mbagent.training_log import check_progress, fit_progress, log_fit, log_rollout
 
 ITERATION_STEPS = 1000
-"""Environment steps between two looks at the logger."""
+"""Environment steps of one iteration; ``log_interval`` counts iterations."""
 
 EXPLORING = 0xE8
-"""Salt of the random numbers of exploration: an environment with the same seed must not draw the same ones."""
+"""Salt of the random numbers of exploration, so that they differ from those of an environment with the same seed."""
 
 MAX_START_STATES = 512
-"""Start states kept for generating the reachable machine."""
+"""Largest number of start states from which the reachable MDP is generated."""
 
 
 class ModelLearningAgent(EnvironmentAlgorithm):
-    """An SB3 algorithm that learns how the world works without reward, and plans on what it learned.
+    """An SB3 algorithm that learns a transition model without using rewards, and plans with this model.
 
     ``learn`` explores, records transitions and fits a transition model (paper section 3). ``predict`` plans
-    on the model (section 4) towards the current goal: the environment's own reward, or whatever ``set_reward`` names.
+    with the model (section 4) for the current goal: the environment's own reward, or the function given to ``set_reward``.
 
-    Any number of threads may call ``predict``, ``explain``, ``set_reward``, ``save`` and ``get_parameters`` of one agent while
-    another one is in ``learn``, ``prune`` or ``set_parameters``: calls wait for each other, and their results are those of one
-    thread. To plan in parallel, give each thread or process an agent of its own (``copy.deepcopy(agent)``).
+    Several threads may call ``predict``, ``explain``, ``set_reward``, ``save`` and ``get_parameters`` of one agent while
+    another thread is in ``learn``, ``prune`` or ``set_parameters``: calls wait for each other, and their results are those of a
+    single thread. To plan in parallel, give each thread or process a separate agent (``copy.deepcopy(agent)``).
 
     Args:
         policy: the planner: "MctsPolicy" (also "MlpPolicy", "CnnPolicy", "MultiInputPolicy"), "FlatMonteCarloPolicy",
             "ValueIterationPolicy", or a subclass of PlannerPolicy.
         env: a Gymnasium environment, an SB3 VecEnv, or a registered id; its spaces must be discrete (see
             FactoredSpace).
-        learning_rate: largest rate of the fit's one-cycle schedule; a function of progress is evaluated at its start.
+        learning_rate: largest rate of the fit's one-cycle schedule; a function of progress is evaluated at the start.
         reward: the goal, see RewardFn; None for the environment's own.
-        model: "auto" (at present "graphs": decision graphs found from data), "networks" (predictor and conditioner trained
-            by gradient), "paper" (section 3's networks), "tabular", "direct" (see ``forecasts``), another registered name,
-            or a TransitionModel.
-        exploration: "auto" ("directed" while the states that matter are few, else "random"), "persistent", or an Exploration.
+        model: "auto" (at present "graphs": decision graphs fitted to data), "networks" (predictor and conditioner trained
+            by gradient descent), "paper" (section 3's networks), "tabular", "direct" (see ``models.neural.forecasts``), another
+            registered name, or a TransitionModel.
+        exploration: "auto" ("directed" while the relevant states are few, else "random"), "persistent", or an Exploration.
         gamma: discount of a step when planning.
         num_simulations: simulations for each decision.
-        time_budget: seconds for each decision instead (see PlannerSettings), or None.
-        horizon: steps a simulation looks ahead, at most.
+        time_budget: seconds for each decision, instead of a number of simulations (see PlannerSettings), or None.
+        horizon: largest number of steps of a simulation.
         policy_kwargs: further PlannerSettings, by name.
-        stats_window_size: episodes that rollout figures in the log average over.
+        stats_window_size: number of episodes over which rollout statistics in the log are averaged.
         tensorboard_log: folder for TensorBoard.
         verbose: 0 nothing, 1 the log, 2 more.
-        seed: of exploration, fit and planning; None draws one.
+        seed: seed of exploration, fit and planning; None draws one.
         device: torch device ("auto" and "cpu" are the same: the networks are small).
 
     Raises:
-        TypeError, ValueError: an unsupported space, an unknown name or a setting out of range, in one sentence.
+        TypeError, ValueError: an unsupported space, an unknown name or a setting out of range; the message is one sentence.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -155,19 +155,19 @@ class ModelLearningAgent(EnvironmentAlgorithm):
 
     @property
     def transitions(self) -> TransitionDataset:
-        """What was met, in the model's factors."""
+        """The observed transitions, in the model's factors."""
         return self.experience.coded(self.policy.factored)
 
     def _setup_model(self) -> None:
         if not hasattr(self, "observation_space"):
-            raise ValueError("env must be an environment or a registered id, got None; load() is the way to an agent without.")
+            raise ValueError("env must be an environment or a registered id, got None; use load() for an agent without one.")
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
         own = {name: getattr(self, name) for name in ("num_simulations", "time_budget", "gamma", "horizon")}
         settings = planner_settings(own, self.policy_kwargs, self._planning_seed)
         space, actions = FactoredSpace(self.observation_space), ActionEnumeration(self.action_space)
         self.experience = Experience(space, actions.n)
-        if isinstance(self.model_name, str):  # a model that is given has the factors that it has
+        if isinstance(self.model_name, str):  # the factors of a given model are fixed
             space = self.experience.coding()
         model, reward_model = self._build_models(space, actions)
         policy = self.policy_class(
@@ -194,13 +194,13 @@ class ModelLearningAgent(EnvironmentAlgorithm):
         self.set_reward(self._custom_reward) if self._custom_reward is not None else self._refresh()
 
     def _build_models(self, space: FactoredSpace, acts: ActionEnumeration) -> tuple[TransitionModel, LearnedReward]:
-        """A transition model and a learned reward, both new, of these factors."""
+        """A new transition model and a new learned reward for these factors."""
         model, n, parts, rate = self.model_name, acts.n, acts.factored.cardinalities, check_learning_rate(self.lr_schedule(1.0))
         model = build_model(model, space, n, rate, parts) if isinstance(model, str) else fitting_model(model, space, n)
         return model, LearnedReward(space.cardinalities, n, space.planes, seed=self._planning_seed, parts=parts)
 
     def _recode(self, space: FactoredSpace) -> None:
-        """Factors whose values are those of ``space``; where that changes anything, nothing is learned in them yet."""
+        """Changes to the factor values of ``space``; if they differ, model and learned reward are replaced by unfitted ones."""
         policy = self.policy
         if space.same_factors(policy.factored):
             return
@@ -209,39 +209,39 @@ class ModelLearningAgent(EnvironmentAlgorithm):
         self.goals.recode()
 
     def set_reward(self, reward: RewardFn | None) -> None:
-        """Changes the goal; nothing is learned anew and no weight of the transition model changes.
+        """Changes the goal; the transition model is neither fitted again nor changed.
 
-        A ``predict`` in another thread plans for the old goal or for the new one, never for a mixture.
+        A ``predict`` in another thread plans for either the old goal or the new one, never for a mixture.
 
         Args:
-            reward: see RewardFn; None for the environment's own reward (or the learned one, see ``goals``).
+            reward: see RewardFn; None for the environment's own reward (or the learned one, see RewardSelector).
 
         Raises:
-            TypeError, ValueError: the function does not return one finite number a transition; the old goal stays.
-            RuntimeError: it raised an error, the cause of this one; the old goal stays. (``predict`` raises this, too, where it
-                fails for transitions that are only imagined; the next goal is planned for as if nothing had been.)
+            TypeError, ValueError: the function does not return one finite number per transition; the old goal is kept.
+            RuntimeError: the function raised an error (the cause of this one); the old goal is kept. ``predict`` also raises
+                this if the function fails for simulated transitions; planning for the next goal is not affected.
         """
         with self.policy.lock:
             self.policy.set_goal(self.goals.choose(reward))
 
     def explain(self, obs: Any, *, n_futures: int = 3, n_steps: int = 10) -> Explanation:
-        """Why ``predict`` takes the action it takes: every action's value, standard error, visits and likeliest futures.
+        """Explains the action that ``predict`` takes: each action's value, standard error, visits and most probable futures.
 
-        The same call gives the same answer, and ``predict`` is not changed by it. It takes about ten times as long as a first
+        The result is reproducible, and later calls of ``predict`` are not affected. It takes about ten times as long as a first
         decision. See Explanation for an example.
 
         Args:
             obs: one observation.
-            n_futures: futures for each action, at most.
-            n_steps: steps of each future, at most.
+            n_futures: largest number of futures for each action.
+            n_steps: largest number of steps of each future.
 
         Raises:
-            ValueError: nothing is learned yet, no goal is known, or a batch is given.
+            ValueError: nothing is learned yet, no goal is known, or ``obs`` is a batch.
         """
         return explain(self.policy, obs, n_futures, n_steps)
 
     def _refresh(self) -> None:
-        """Drops every planning cache and works the goal out anew."""
+        """Clears all planning caches and selects the goal again."""
         self.policy.goal = None
         self.policy.refresh()
         if self.policy.fitted:
@@ -256,24 +256,24 @@ class ModelLearningAgent(EnvironmentAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """Explores for ``total_timesteps`` steps, then fits the model to everything met so far.
+        """Explores for ``total_timesteps`` steps, then fits the model to all transitions observed so far.
 
-        A run stopped by a callback still fits what it has. Called again, it goes on: transitions are kept. The fit comes
-        at the end, so callbacks that evaluate or save on the way see the agent as it was before: for a learning curve,
-        call it several times with ``reset_num_timesteps=False``.
+        If a callback stops the run, the model is fitted to the steps taken until then. Further calls keep all transitions.
+        Since the fit happens at the end, callbacks that evaluate or save during the run use the agent as it was before: for a
+        learning curve, call ``learn`` several times with ``reset_num_timesteps=False``.
 
         Args:
-            total_timesteps: environment steps, over all copies of the environment; 0 only fits what was met before.
+            total_timesteps: environment steps, over all copies of the environment; 0 only fits to earlier transitions.
             callback: SB3 callbacks, called at every step.
-            log_interval: iterations (of 1,000 steps) between two entries in the log; None for none.
+            log_interval: iterations (of 1,000 steps) between two entries in the log; None for no log.
             tb_log_name: name of the run in TensorBoard.
-            reset_num_timesteps: False counts on from the last call.
-            progress_bar: shows one (needs ``pip install "mbagent[progress]"``).
+            reset_num_timesteps: False continues the count of the last call.
+            progress_bar: whether to show a progress bar (needs ``pip install "mbagent[progress]"``).
 
         Raises:
-            TypeError, ValueError, ImportError: an argument is none of these; there is no environment, or nothing to fit; a
-                package for the progress bar is missing. No step is taken then.
-            TypeError, ValueError: the environment returned something else than it declares.
+            TypeError, ValueError, ImportError: an argument is invalid; there is no environment, or nothing to fit to; or a
+                package for the progress bar is missing. No step is taken in these cases.
+            TypeError, ValueError: the environment returned values that do not match its declared spaces.
             RuntimeError: a process of a SubprocVecEnv has ended. After this or any other error the steps recorded so far are
                 kept: ``learn(0)`` fits to them without using the environment; ``learn`` with more steps begins with a reset.
         """
@@ -284,7 +284,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
         check_callback(callback)
         check_progress(progress_bar)
         if not steps and not len(self.experience.dataset):
-            raise ValueError("learn(0) only fits the transitions collected so far, and there are none; ask for steps.")
+            raise ValueError("learn(0) only fits the transitions collected so far, and there are none; give a number of steps.")
         total, callbacks = self._setup_learn(steps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         if self._recorder is None or (fresh_start and self._last_obs is not None):
             self._recorder = ExperienceRecorder(self.experience.space, self.experience.dataset, self.n_envs)
@@ -293,16 +293,16 @@ class ModelLearningAgent(EnvironmentAlgorithm):
             catch_up(self._explorer, self.experience.dataset)
         warn_of_forgetting(self.policy.fitted and isinstance(self.model_name, str), self.experience.dataset)
         callbacks.on_training_start(locals(), globals())
-        going, iteration = True, 0
+        running, iteration = True, 0
         try:
-            while going and self.num_timesteps < total:
-                going = self._explore(min(total, self.num_timesteps + ITERATION_STEPS), callbacks, self._recorder)
+            while running and self.num_timesteps < total:
+                running = self._explore(min(total, self.num_timesteps + ITERATION_STEPS), callbacks, self._recorder)
                 iteration += 1
                 self._update_current_progress_remaining(self.num_timesteps, max(total, 1))
                 if log_interval is not None and iteration % log_interval == 0:
                     log_rollout(self, self.start_time, self._num_timesteps_at_start)
                     self.logger.dump(self.num_timesteps)
-        finally:  # an interrupted run keeps what it met: learn(0) fits to it
+        finally:  # an interrupted run keeps its transitions, and learn(0) fits to them
             self._recorder.flush()
         if len(self.experience.dataset):
             self._recorder.warn_of_reused_arrays()
@@ -315,14 +315,14 @@ class ModelLearningAgent(EnvironmentAlgorithm):
         return self
 
     def _explore(self, until: int, callback: BaseCallback, recorder: ExperienceRecorder) -> bool:
-        """Steps all environments until ``num_timesteps`` reaches ``until``; False if a callback stopped it."""
+        """Steps all environments until ``num_timesteps`` reaches ``until``; returns False if a callback stopped the run."""
         env, watcher = cast("VecEnv", self.env), self._explorer if isinstance(self._explorer, Watching) else None
         callback.on_rollout_start()
         while self.num_timesteps < until:
             assert recorder.states is not None
             indices = self._explorer.act(recorder.states, self._rng)
             actions = self.policy.actions.decode(indices)
-            self._last_obs = None  # should the step fail, it is not known where the environment stands
+            self._last_obs = None  # if the step fails, the environment's state is unknown
             new_obs, rewards, dones, infos = step(env, actions)
             self.num_timesteps += env.num_envs
             if (original := self._vec_normalize_env) is not None:
@@ -341,7 +341,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
 
     @contextmanager
     def _undone_on_error(self) -> Iterator[None]:
-        """Puts back what the agent has learned if a fit does not come to its end: half of it must not be planned with."""
+        """Restores the previous models if a fit fails or is interrupted, so that incomplete ones are never used for planning."""
         policy, before, goal = self.policy, self.policy.parts(), self.policy.goal
         weights = policy.state_dict() if policy.fitted else {}
         try:
@@ -355,7 +355,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
             raise
 
     def _fit(self, recorder: ExperienceRecorder, progress_bar: bool) -> None:
-        """Fits the model, then works out goal and machine."""
+        """Fits the model, selects the goal, makes a first plan and logs the results."""
         if isinstance(self.model_name, str):
             self._recode(self.experience.coding())
         with fit_progress(progress_bar) as progress:
@@ -377,19 +377,19 @@ class ModelLearningAgent(EnvironmentAlgorithm):
             self.logger.record("plan/goal", self.goals.source)
 
     def prune(self, fraction: float, *, progress_bar: bool = False, config: PruningConfig | None = None) -> Self:
-        """Removes the smallest weights of the model's networks, trains what is left on the transitions met, and plans on with it.
+        """Removes the smallest weights of the model's networks and trains the remaining ones on the observed transitions.
 
-        Each network loses this share of its connections, and those left over that the transitions do not call for; the goal
-        stays. Pruned again, the agent goes on from what is left. ``learn`` fits anew, with all connections.
+        Each network loses this share of its connections, and further ones that the transitions do not support; the goal
+        is kept. Repeated calls prune the remaining connections. ``learn`` fits again from scratch, with all connections.
 
         Args:
-            fraction: least share of the connections that are gone afterwards, 0 or more and less than 1.
-            progress_bar: shows one.
-            config: how, see PruningConfig; ``PruningConfig(evidence=False)`` removes this share and no more.
+            fraction: smallest share of the connections that are removed, in [0, 1).
+            progress_bar: whether to show a progress bar.
+            config: see PruningConfig; ``PruningConfig(evidence=False)`` removes exactly this share.
 
         Raises:
             ValueError: a fraction out of range, nothing learned yet, or no transitions to train on (after ``load``).
-            TypeError: the model has no weights. The agent is as it was in each of these cases, as after any other error.
+            TypeError: the model has no weights. After these or any other errors the agent is unchanged.
         """
         fraction = check_fraction(fraction)
         model = prunable(self.model, self.policy.fitted, len(self.experience.dataset))
@@ -398,7 +398,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
             self._n_updates += 1
             self.fit_report = report
             self._refresh()
-        if hasattr(self, "_logger"):  # a loaded agent has none before it learns
+        if hasattr(self, "_logger"):  # a loaded agent has no logger before ``learn``
             log_fit(self.logger, report, self._n_updates, len(self.transitions), len(self.policy.start_states))
         return self
 
@@ -418,7 +418,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
             transitions: whether to include the transitions.
 
         Raises:
-            ValueError: the model, the exploration or the policy is an object, which data cannot rebuild.
+            ValueError: the model, the exploration or the policy is an object, which cannot be rebuilt from plain data.
         """
         if not isinstance(self.model_name, str):
             raise ValueError(
@@ -430,7 +430,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
         policy = self.policy
         with policy.lock:
             if policy.fitted:
-                self.goals.fit_learned()  # a loaded agent without an environment plans for it
+                self.goals.fit_learned()  # the goal of a loaded agent without an environment
             arrays = {"policy": policy.arrays(), "planning": {"start_states": policy.start_states}}
             if transitions:
                 rows = self.experience.dataset.rows()
@@ -456,7 +456,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
 
     @classmethod
     def from_state(cls, state: AgentState, env: GymEnv | None = None, *, reward: RewardFn | None = None, **kwargs: Any) -> Self:
-        """The agent that a state was taken from.
+        """An agent restored from its ``state``.
 
         Args:
             state: see ``state``.
@@ -465,7 +465,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
             **kwargs: constructor arguments that override those of the state.
 
         Raises:
-            TypeError, ValueError: an unknown argument, other spaces, or weights that do not fit.
+            TypeError, ValueError: an unknown argument, an environment with other spaces, or weights that do not fit.
         """
         check_overrides(cls.__init__, kwargs)
         data = state.data
@@ -488,7 +488,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
         return agent
 
     def _restore(self, state: AgentState, reward: RewardFn | None) -> None:
-        """Takes weights, start states, transitions and goal from a state."""
+        """Restores weights, start states, transitions and goal from a state."""
         self._recode(self.policy.factored.from_value_arrays(state.arrays["policy"]))
         policy, fitted = self.policy, bool(state.data["fitted"])
         policy.start_states = state.start_states(np.asarray(policy.factored.cardinalities))
@@ -508,17 +508,17 @@ class ModelLearningAgent(EnvironmentAlgorithm):
     def save(  # type: ignore[override]
         self, path: Target, exclude: Sequence[str] | None = None, include: Sequence[str] | str | None = None
     ) -> None:
-        """Writes settings, weights, start states and the learned reward to a zip that holds no code (see ``checkpoint``).
+        """Writes settings, weights, start states and the learned reward to a zip without code (see ``checkpoint``).
 
         Args:
-            path: a path (".zip" is added where there is no suffix) or an open binary file.
-            exclude: accepted as in SB3; nothing here can be left out.
+            path: a path (".zip" is added if it has no suffix) or an open binary file.
+            exclude: accepted for compatibility with SB3; ignored.
             include: ``"transitions"``, or a list of it, adds the observed transitions.
 
         Raises:
-            ValueError: the model or the exploration is an object that a file cannot rebuild, or ``include`` names anything else.
+            ValueError: the model or the exploration is an object that a file cannot rebuild, or ``include`` is anything else.
             TypeError: ``path`` is neither a path nor an open binary file.
-            OSError: the file cannot be written; one that was there before is unchanged.
+            OSError: the file cannot be written; an existing file is unchanged.
         """
         del exclude
         names = [include] if isinstance(include, str) else include or ()
@@ -539,20 +539,20 @@ class ModelLearningAgent(EnvironmentAlgorithm):
         reward: RewardFn | None = None,
         **kwargs: Any,
     ) -> Self:
-        """The agent that ``save`` wrote; no code in the file is ever run.
+        """An agent from a file written by ``save``; no code in the file is ever run.
 
         Args:
-            path: where it was written.
+            path: a path or an open binary file.
             env: a new environment, with the same spaces.
             device: torch device.
-            custom_objects: accepted as in SB3; files hold no objects that could be replaced.
-            print_system_info: accepted as in SB3.
+            custom_objects: accepted for compatibility with SB3; ignored, since files contain no objects to replace.
+            print_system_info: as in SB3.
             force_reset: whether ``learn`` starts with a reset.
             reward: the goal; needed again if it was a custom one.
             **kwargs: constructor arguments that override the saved ones.
 
         Raises:
-            FileNotFoundError, TypeError, ValueError: no such file, no path at all, or no saved agent.
+            FileNotFoundError, TypeError, ValueError: there is no such file, ``path`` is not a path, or not a saved agent.
         """
         del custom_objects
         if print_system_info:
@@ -568,7 +568,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
         exact_match: bool = True,
         device: torch.device | str = "auto",
     ) -> None:
-        """Takes weights from a saved agent or from ``get_parameters``; planning caches are dropped, the goal stays."""
+        """Loads weights from a saved agent or from ``get_parameters``; planning caches are cleared, the goal is kept."""
         params = load_path_or_dict
         if not isinstance(params, Mapping):
             params = {"policy": checkpoint.read(params).arrays["policy"]}
@@ -587,14 +587,14 @@ class ModelLearningAgent(EnvironmentAlgorithm):
             self._refresh()
 
     def save_transitions(self, path: Target) -> None:
-        """Writes what was experienced as an ``.npz`` of plain arrays (see TransitionDataset.save, also for what it raises)."""
+        """Writes the observed transitions as an ``.npz`` of plain arrays; see TransitionDataset.save, also for its errors."""
         self.experience.dataset.save(path)
 
     def load_transitions(self, path: Target) -> None:
-        """Takes transitions from a file into this agent's experience; the next ``learn`` fits to them too.
+        """Adds transitions from a file to this agent's experience; the next ``learn`` also fits to them.
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: it holds no transitions, or those of another kind of environment; nothing is changed then.
+            ValueError: the file contains no transitions, or those of another environment; the agent is unchanged.
         """
         self.experience.dataset.take(TransitionDataset.load(path))

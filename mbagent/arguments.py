@@ -1,4 +1,4 @@
-"""What the agent's arguments must be; every check names mistake and fix in one sentence."""
+"""Checks of the agent's arguments; each error names the mistake and the fix in one sentence."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ MAX_SEED = 2**32 - 1
 
 
 def fitting_model(model: TransitionModel, space: FactoredSpace, n_actions: int) -> TransitionModel:
-    """A model that was given, if it is one of this environment.
+    """The given model, if it fits this environment.
 
     Raises:
-        ValueError: it has other factors or actions.
+        ValueError: the model has other factors or actions.
     """
     if tuple(model.cardinalities) != space.cardinalities or model.n_actions != n_actions:
         raise ValueError(
             f"The model has {len(model.cardinalities)} factors and {model.n_actions} actions, but the environment "
-            f"{len(space)} and {n_actions}; build the model for this environment's spaces."
+            f"has {len(space)} and {n_actions}; build the model for this environment's spaces."
         )
     return model
 
 
 def planner_settings(own: Mapping[str, Any], policy_kwargs: Mapping[str, Any], seed: int) -> PlannerSettings:
-    """The agent's own settings of the planner and those of ``policy_kwargs``.
+    """Planner settings from the agent's own arguments and from ``policy_kwargs``.
 
     Raises:
-        TypeError: it is no dict, or there is no setting of that name.
-        ValueError: one is out of range.
+        TypeError: ``policy_kwargs`` is not a dict, or contains an unknown setting.
+        ValueError: a setting is out of range.
     """
     if not isinstance(policy_kwargs, Mapping):
         raise TypeError(f"policy_kwargs must be a dict of planner settings, got {policy_kwargs!r}.")
@@ -61,7 +61,7 @@ def check_seed(seed: Any) -> int | None:
 
 
 def check_timesteps(total: Any) -> int:
-    """``total_timesteps`` as an int; 1e5 is one, 2.5 is not. 0 fits what is known without a step."""
+    """``total_timesteps`` as an int; 1e5 is accepted, 2.5 is not. 0 means a fit to the recorded transitions, without a step."""
     number = not isinstance(total, bool) and isinstance(total, int | float | np.number)
     if not number or not math.isfinite(total) or total < 0 or total != int(total):
         raise ValueError(f"total_timesteps must be a whole number of environment steps, 0 or more, got {total!r}.")
@@ -69,7 +69,7 @@ def check_timesteps(total: Any) -> int:
 
 
 def check_count(name: str, count: Any, none: str) -> int | None:
-    """An argument that is a number of at least 1, as an int; or None, which means ``none``."""
+    """An integer argument of at least 1, as an int; or None. ``none`` is the meaning of None, for the error message."""
     if count is None:
         return None
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
@@ -78,7 +78,7 @@ def check_count(name: str, count: Any, none: str) -> int | None:
 
 
 def check_callback(callback: Any) -> None:
-    """The ``callback`` argument: one of SB3's, a list of these, a function of (locals, globals), or None."""
+    """Checks the ``callback`` argument: an SB3 callback, a list of these, a function of (locals, globals), or None."""
     for each in callback if isinstance(callback, list) else [callback]:
         if not (isinstance(each, BaseCallback) or (each is callback and (each is None or callable(each)))):
             raise TypeError(
@@ -88,12 +88,12 @@ def check_callback(callback: Any) -> None:
 
 
 def check_device(device: Any) -> torch.device | str:
-    """The ``device`` argument; "auto" is the processor."""
+    """The ``device`` argument; "auto" means "cpu"."""
     try:
         return "cpu" if device == "auto" else torch.device(device)
     except (RuntimeError, TypeError) as error:
         raise ValueError(
-            f"device must be 'auto', 'cpu' or another device that torch knows, such as 'cuda', got {device!r}."
+            f"device must be 'auto', 'cpu' or another device that torch supports, such as 'cuda', got {device!r}."
         ) from error
 
 
@@ -114,7 +114,7 @@ def check_learning_rate(rate: Any) -> float:
 
 
 def check_model(model: Any) -> str | TransitionModel:
-    """The ``model`` argument: a name or an object that does what a TransitionModel does."""
+    """The ``model`` argument: a name, or an object that implements TransitionModel."""
     if isinstance(model, str | TransitionModel):
         return model
     raise TypeError(f"model must be 'auto', another registered name, or a TransitionModel, got {model!r}.")
@@ -131,10 +131,10 @@ def check_exploration(exploration: Any) -> str | Exploration:
 
 
 def check_overrides(constructor: Callable[..., Any], given: Mapping[str, Any]) -> None:
-    """Whether ``load`` and ``from_state`` take these arguments.
+    """Checks that ``load`` and ``from_state`` accept these arguments.
 
     Raises:
-        TypeError: one is no argument of the constructor, or not one that can be overridden.
+        TypeError: an argument is not one of the constructor's, or cannot be overridden.
     """
     fixed = {"self", "policy", "env", "reward", "_init_setup_model"}
     allowed = set(inspect.signature(constructor).parameters) - fixed
@@ -143,14 +143,12 @@ def check_overrides(constructor: Callable[..., Any], given: Mapping[str, Any]) -
 
 
 def policy_name(policy_class: type[BasePolicy], aliases: Mapping[str, type[BasePolicy]]) -> str:
-    """The name that a policy has in a file.
+    """The name under which a policy is saved.
 
     Raises:
-        ValueError: it has none.
+        ValueError: the policy has no name.
     """
     for name, known in aliases.items():
         if known is policy_class:
             return name
-    raise ValueError(
-        f"The policy {policy_class.__name__} has no name that a file could hold; add it to ModelLearningAgent.policy_aliases."
-    )
+    raise ValueError(f"The policy {policy_class.__name__} has no name for saving; add it to ModelLearningAgent.policy_aliases.")

@@ -1,4 +1,4 @@
-"""Saving and loading agents as files that hold no code: SB3's zip layout with JSON data and plain arrays."""
+"""Saving and loading agents as files that contain no code: SB3's zip layout with JSON data and plain arrays."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ SETTINGS = (
     "verbose",
     "seed",
 )
-"""Constructor arguments kept as they are; keyword arguments of ``load`` override them."""
+"""Constructor arguments that are saved unchanged; keyword arguments of ``load`` override them."""
 
 REQUIRED = (
     "policy_class",
@@ -54,14 +54,14 @@ REQUIRED = (
     "n_envs",
     "n_updates",
 )
-"""What a file's data must hold."""
+"""Keys that a file's data must contain."""
 
 
 def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
     """A discrete space as JSON data.
 
     Raises:
-        TypeError: the space has no such form.
+        TypeError: this type of space is not supported.
     """
     if isinstance(space, spaces.Discrete):
         return {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
@@ -93,10 +93,10 @@ def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
 
 
 def space_from_json(data: Mapping[str, Any]) -> spaces.Space[Any]:
-    """The space that ``space_to_json`` wrote.
+    """The space written by ``space_to_json``.
 
     Raises:
-        ValueError: the data names no known space.
+        ValueError: the type of space is unknown.
     """
     kind = data.get("type")
     if kind == "Discrete":
@@ -117,32 +117,32 @@ def space_from_json(data: Mapping[str, Any]) -> spaces.Space[Any]:
 
 @dataclass(frozen=True)
 class AgentState:
-    """An agent as plain data: what a file holds of it.
+    """An agent as plain data: the contents of its file.
 
     Attributes:
-        data: JSON data, with the keys REQUIRED.
+        data: JSON data, with at least the keys in REQUIRED.
         arrays: by group and name: "policy" (weights), "planning" (start states), and "transitions" if they are included.
 
     Raises:
-        ValueError: something is missing or of the wrong kind; the message names it.
+        ValueError: an entry is missing or of the wrong type; the message names it.
     """
 
     data: Mapping[str, Any]
     arrays: Mapping[str, Mapping[str, NDArray[Any]]]
 
     def __post_init__(self) -> None:
-        """Checks that all is there."""
+        """Checks that the state is complete."""
         missing = [name for name in REQUIRED if name not in self.data]
         missing += [f"{name}.npz" for name in ("policy", "planning") if name not in self.arrays]
         if not missing and "start_states" not in self.arrays["planning"]:
             missing = ["planning.npz: start_states"]
         if missing:
-            raise ValueError(f"The file is no complete saved agent: it lacks {', '.join(missing)}.")
+            raise ValueError(f"The file is not a complete saved agent: it lacks {', '.join(missing)}.")
         if not isinstance(self.data["settings"], dict) or self.data["reward_source"] not in get_args(Source):
             raise ValueError("The file is damaged: its settings or its reward source cannot be read.")
 
     def weights(self, prefix: str) -> dict[str, NDArray[Any]]:
-        """The policy's arrays whose names begin with ``prefix``, without it."""
+        """The policy's arrays whose names begin with ``prefix``; the prefix is removed from the names."""
         return {name.removeprefix(prefix): value for name, value in self.arrays["policy"].items() if name.startswith(prefix)}
 
     def start_states(self, cardinalities: Ints) -> States:
@@ -152,7 +152,7 @@ class AgentState:
             cardinalities: number of values of each factor, int64 [F].
 
         Raises:
-            ValueError: they are no states of such factors.
+            ValueError: the saved start states are not states of these factors.
         """
         found = self.arrays["planning"]["start_states"].astype(np.int64)
         if found.ndim != 2 or found.shape[1] != len(cardinalities) or (found < 0).any() or (found >= cardinalities).any():
@@ -166,9 +166,9 @@ class AgentState:
 
 
 def write(target: Target, state: AgentState) -> None:
-    """Writes a zip with the state's ``data`` as JSON and each group of its ``arrays`` as an ``.npz`` of its own.
+    """Writes a zip with the state's ``data`` as JSON and each group of its ``arrays`` as a separate ``.npz``.
 
-    A path without suffix gets ``.zip``, as in SB3; missing folders are made. The file is complete or not there.
+    A path without suffix gets ``.zip``, as in SB3; missing folders are created. An interrupted call leaves no partial file.
 
     Raises:
         TypeError, ValueError, OSError: see ``files.writing``.
@@ -187,12 +187,12 @@ def write(target: Target, state: AgentState) -> None:
 
 
 def read(source: Target) -> AgentState:
-    """Reads what ``write`` wrote; nothing in the file is ever run.
+    """Reads a file written by ``write``; no code in the file is ever run.
 
     Raises:
         FileNotFoundError: there is no such file.
         TypeError: ``source`` is neither a path nor an open binary file.
-        ValueError: the file is of another kind, incomplete, or holds serialized code; the message names what is wrong.
+        ValueError: the file is of another kind, incomplete, or contains serialized code; the message names the problem.
     """
     label: Any = "The file"
     try:
@@ -211,20 +211,20 @@ def read(source: Target) -> AgentState:
                 raise ValueError(f"{label} was not saved by ModelLearningAgent; load it with the program that saved it.")
             arrays = {Path(name).stem: _arrays(archive, name, label) for name in names if name.endswith(".npz")}
     except (zipfile.BadZipFile, json.JSONDecodeError, UnicodeDecodeError, KeyError, NotImplementedError, zlib.error) as error:
-        raise ValueError(f"{label} is no saved agent, or is damaged: {error}.") from error
+        raise ValueError(f"{label} is not a saved agent, or is damaged: {error}.") from error
     return AgentState(data, arrays)
 
 
 def refuse_serialized(data: Any, names: list[str]) -> None:
-    """Raises ValueError, naming the entry, if the file holds pickled objects, which would run code when read."""
+    """Raises ValueError, naming the entry, if the file contains pickled objects, which would run code when read."""
     for name in names:
         if name.endswith((".pth", ".pt", ".pkl", ".pickle")):
-            raise ValueError(f"The file's entry {name!r} is a pickle, which runs code when read; mbagent files hold none.")
+            raise ValueError(f"The file's entry {name!r} is a pickle, which runs code when read; mbagent files contain none.")
     if not isinstance(data, dict):
-        raise ValueError("The file's entry 'data' is no JSON object; it was not saved by an mbagent agent.")
+        raise ValueError("The file's entry 'data' is not a JSON object; it was not saved by an mbagent agent.")
     for key, value in data.items():
         if isinstance(value, dict) and ":serialized:" in value:
-            raise ValueError(f"The file's entry {key!r} is serialized code; mbagent files hold none, so it is refused.")
+            raise ValueError(f"The file's entry {key!r} is serialized code; mbagent files contain none, so it is refused.")
 
 
 def _arrays(archive: zipfile.ZipFile, name: str, label: Any) -> dict[str, NDArray[Any]]:

@@ -1,6 +1,6 @@
 """Transitions: the dataset, and the recorder that turns the steps of a vector environment into transitions.
 
-Nothing here knows what a reward is for. A reset is never recorded as a transition.
+Rewards are stored but not interpreted here. A reset is never recorded as a transition.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ from mbagent_envs.random_keys import hash_rows
 _COLUMNS = ("states", "actions", "next_states", "terminated", "rewards", "episodes")
 _KEPT = ("before", "actions", "after", "terminated", "rewards", "episodes")
 
-_ABOUT = "dataset.json"
+_DESCRIPTION = "dataset.json"
 
 _MAPPED = 1_000_000
-"""Bytes of a selection of mapped rows from which on it is mapped, too."""
+"""Smallest size in bytes at which a selection of rows of a mapped array is itself stored in a mapped file."""
 
 Factors: TypeAlias = NDArray[np.integer[Any]]
-"""Values of factors, of whatever width holds them."""
+"""Values of factors, of any integer type."""
 
 
 @dataclass(frozen=True)
 class TransitionBatch:
-    """Rows of experience.
+    """A batch of transitions, one per row.
 
-    States are kept as narrow as they are given: a dataset keeps bits as single bytes, an eighth of what int64 takes.
+    States keep the integer type they are given in: a dataset stores bits as single bytes, an eighth of the size of int64.
 
     Attributes:
         before: states, int [N, F] of any width.
         actions: int64 [N], numbers of the enumerated actions.
         after: next states, as ``before``.
-        terminated: bool [N]; truncation is not recorded, since it says nothing of the world.
-        rewards: float64 [N], as met (kept for the learned reward; no transition model reads them).
-        episodes: int64 [N], which episode a row is from.
+        terminated: bool [N]; truncation is not recorded, since it is not part of the dynamics.
+        rewards: float64 [N], as observed (for the learned reward; transition models do not use them).
+        episodes: int64 [N], episode number of each row.
     """
 
     before: Factors
@@ -66,7 +66,7 @@ class TransitionBatch:
 
     @property
     def states(self) -> NDArray[np.int64]:
-        """States, int64 [N, F]; made anew at every call where they are kept narrower."""
+        """States, int64 [N, F]; a new array at each call if they are stored in a narrower type."""
         return self.before.astype(np.int64, copy=False)
 
     @property
@@ -75,29 +75,29 @@ class TransitionBatch:
         return self.after.astype(np.int64, copy=False)
 
     def select(self, rows: NDArray[Any] | slice) -> TransitionBatch:
-        """The rows with the given indices or mask, as narrow as these; many rows of mapped files are in a mapped file, too."""
-        return TransitionBatch(*(_taken(getattr(self, name), rows) for name in _KEPT))
+        """The rows with the given indices or mask, in the same types; large selections of mapped arrays are mapped as well."""
+        return TransitionBatch(*(_selected(getattr(self, name), rows) for name in _KEPT))
 
     def narrowed(self, kind: np.dtype[Any]) -> TransitionBatch:
         """The same rows with states of another integer type."""
         return replace(self, before=self.before.astype(kind, copy=False), after=self.after.astype(kind, copy=False))
 
     def parts(self, size: int) -> Iterator[TransitionBatch]:
-        """The rows, at most ``size`` at once, in their order."""
+        """The rows in order, in batches of at most ``size``."""
         for begin in range(0, len(self), size):
             yield self.select(slice(begin, begin + size))
 
 
 @dataclass
 class TransitionDataset:
-    """All transitions met so far, append-only.
+    """All transitions observed so far, append-only.
 
     Args:
         cardinalities: number of values of each state factor, length F.
         n_actions: number of enumerated actions A.
-        folder: where to keep the rows, in files that grow and are mapped into memory, so that there may be more than fit
-            into it; None to keep them in memory. Rows that are in the folder already are the first. Rows count as soon as all
-            columns of a call of ``append`` are on the disk: of one that was interrupted, none do.
+        folder: folder for the rows, in growing files that are mapped into memory, so that the data may be larger than memory;
+            None to keep them in memory. Rows that are already in the folder come first. Rows of an ``append`` are added
+            only when all of its columns are on the disk: an interrupted call adds none.
 
     Raises:
         ValueError: the folder holds transitions of another environment.
@@ -109,15 +109,15 @@ class TransitionDataset:
     _chunks: list[TransitionBatch] = field(default_factory=list, repr=False)
 
     def __post_init__(self) -> None:
-        """Begins a folder, or goes on with what is in it."""
+        """Creates the folder, or opens the existing one."""
         self.cardinalities = tuple(int(c) for c in self.cardinalities)
         if self.folder is not None:
-            self._chunks = [_begun(Path(self.folder), self.cardinalities, self.n_actions, self.kind)]
-        self._lock = Lock()  # rows that one thread adds while another merges the others must not be lost
+            self._chunks = [_open_folder(Path(self.folder), self.cardinalities, self.n_actions, self.kind)]
+        self._lock = Lock()  # rows that one thread appends while another merges chunks must not be lost
 
     @property
     def kind(self) -> np.dtype[Any]:
-        """The smallest unsigned integers that hold all values of factors."""
+        """The smallest unsigned integer type that can represent all values of all factors."""
         return np.min_scalar_type(max((*self.cardinalities, 2)) - 1)
 
     def __len__(self) -> int:
@@ -133,7 +133,7 @@ class TransitionDataset:
         """Adds rows.
 
         Raises:
-            ValueError: states of another width, or values or actions out of range.
+            ValueError: a wrong number of factors, or values or actions out of range.
         """
         self._check(batch)
         with self._lock:
@@ -146,12 +146,12 @@ class TransitionDataset:
             folder, n_factors = Path(self.folder), len(self.cardinalities)
             with _locked(folder):
                 if len(_mapped(folder, n_factors, self.kind)) != len(self):
-                    raise ValueError(f"Another dataset has written to {folder} since this one read it; load it anew.")
+                    raise ValueError(f"Another dataset has written to {folder} since this one read it; load it again.")
                 _write(folder, narrow, len(self))
             self._chunks = [_mapped(folder, n_factors, self.kind)]
 
     def _check(self, batch: TransitionBatch) -> None:
-        """Refuses rows that are not of this dataset's kind."""
+        """Raises ValueError if rows do not have this dataset's factors and actions."""
         n, n_factors = len(batch), len(self.cardinalities)
         if batch.before.shape != (n, n_factors) or batch.after.shape != batch.before.shape:
             raise ValueError(
@@ -179,7 +179,7 @@ class TransitionDataset:
         """Appends all rows of another dataset, as further episodes.
 
         Raises:
-            ValueError: it is of another kind of environment; nothing is changed then.
+            ValueError: the other dataset has other factors or actions; this one is unchanged.
         """
         if (other.cardinalities, other.n_actions) != (self.cardinalities, self.n_actions):
             raise ValueError(
@@ -192,7 +192,7 @@ class TransitionDataset:
             self.append(replace(rows, episodes=rows.episodes + first))
 
     def rows(self) -> TransitionBatch:
-        """All rows as one batch, in the order met."""
+        """All rows as one batch, in the order in which they were observed."""
         if not self._chunks:
             n = len(self.cardinalities)
             ints, none = np.zeros((0, n), dtype=self.kind), np.zeros(0, dtype=np.int64)
@@ -204,14 +204,14 @@ class TransitionDataset:
             return self._chunks[0]
 
     def split(self, fraction: float, seed: int, min_episodes: int = 10) -> tuple[TransitionBatch, TransitionBatch]:
-        """Splits into training and validation rows by whole episodes, so that no row's neighbour leaks across.
+        """Splits into training and validation rows by whole episodes, so that consecutive steps are never in both parts.
 
-        With fewer than ``min_episodes`` episodes, each is first cut into equal runs of consecutive steps.
+        With fewer than ``min_episodes`` episodes, the rows are instead cut into ``min_episodes`` runs of consecutive steps.
 
         Args:
             fraction: share of episodes for validation.
-            seed: which episodes.
-            min_episodes: as said above.
+            seed: seed of the selection of episodes.
+            min_episodes: see above.
 
         Returns:
             (training, validation); with a fraction of 0, or fewer than 10 rows, both are all rows.
@@ -223,7 +223,7 @@ class TransitionDataset:
         return rows.select(~held_out), rows.select(held_out)
 
     def held_out(self, fraction: float, seed: int, min_episodes: int = 10) -> NDArray[np.bool_]:
-        """Which rows ``split`` holds out, bool [N]."""
+        """Mask of the rows that ``split`` holds out, bool [N]."""
         rows = self.rows()
         if fraction == 0.0 or len(rows) < 10:
             return np.zeros(len(rows), dtype=np.bool_)
@@ -236,14 +236,14 @@ class TransitionDataset:
         return result
 
     def save(self, path: files.Target) -> None:
-        """Writes the table as a compressed ``.npz`` (plain arrays: any language reads it, nothing is pickled).
+        """Writes the table as a compressed ``.npz`` of plain arrays, without pickled objects.
 
         Args:
-            path: a path (".npz" is added where it does not end so) or an open binary file.
+            path: a path (".npz" is added unless it ends with it) or an open binary file.
 
         Raises:
             TypeError, ValueError: ``path`` is neither.
-            OSError: the file cannot be written; one that was there before is unchanged.
+            OSError: the file cannot be written; an existing file is unchanged.
         """
         rows = self.rows()
         with files.writing(path, ".npz", always=True) as file:
@@ -257,18 +257,18 @@ class TransitionDataset:
 
     @classmethod
     def load(cls, path: files.Target) -> TransitionDataset:
-        """Reads what ``save`` wrote; or, mapped into memory, a dataset's folder.
+        """Reads a file written by ``save``, or opens a dataset's folder, mapped into memory.
 
         Args:
-            path: a path (".npz" may be left out), an open binary file, or a folder.
+            path: a path (".npz" may be omitted), an open binary file, or a folder.
 
         Raises:
             FileNotFoundError: there is no such file.
             TypeError: ``path`` is none of these.
-            ValueError: the file, or what is in the folder, is not such a table.
+            ValueError: the file or the folder does not contain such a table.
         """
         if path and isinstance(path, str | os.PathLike) and Path(path).is_dir() and not Path(f"{os.fspath(path)}.npz").is_file():
-            about = _about(Path(path))
+            about = _read_description(Path(path))
             return cls(tuple(about["cardinalities"]), about["n_actions"], path)
         cardinalities, n_actions, rows = _table(path)
         data = cls(cardinalities, n_actions)
@@ -276,8 +276,8 @@ class TransitionDataset:
         return data
 
 
-def _taken(values: NDArray[Any], rows: NDArray[Any] | slice) -> NDArray[Any]:
-    """Some rows; where they are many of a mapped array, in a temporary file that is mapped."""
+def _selected(values: NDArray[Any], rows: NDArray[Any] | slice) -> NDArray[Any]:
+    """The selected rows; a large selection of a mapped array is mapped to a temporary file."""
     if not isinstance(values, np.memmap) or isinstance(rows, slice):
         return values[rows]
     numbers = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
@@ -293,7 +293,7 @@ def _taken(values: NDArray[Any], rows: NDArray[Any] | slice) -> NDArray[Any]:
 
 
 def _table(source: files.Target) -> tuple[tuple[int, ...], int, TransitionBatch]:
-    """What a file holds that ``TransitionDataset.save`` wrote: cardinalities, number of actions and rows."""
+    """Cardinalities, number of actions and rows from a file written by ``TransitionDataset.save``."""
     with files.reading(source, ".npz") as file:
         label = getattr(file, "name", "The file")
         try:
@@ -304,62 +304,62 @@ def _table(source: files.Target) -> tuple[tuple[int, ...], int, TransitionBatch]
             columns: Any = (table[name].astype(np.int64) if name in ("actions", "episodes") else table[name] for name in _COLUMNS)
             return tuple(int(c) for c in table["cardinalities"]), int(table["n_actions"]), TransitionBatch(*columns)
         except (ValueError, TypeError) as error:
-            raise ValueError(f"{label} is no table of transitions that save_transitions wrote: {error}.") from error
+            raise ValueError(f"{label} is not a table of transitions written by save_transitions: {error}.") from error
 
 
-def _about(folder: Path) -> dict[str, Any]:
-    """What a dataset's folder says of its columns; ``rows`` is None in folders of before it was written down."""
+def _read_description(folder: Path) -> dict[str, Any]:
+    """The description of a dataset's folder; ``rows`` is None for folders of versions that did not store it."""
     try:
-        about = json.loads((folder / _ABOUT).read_text(encoding="utf-8"))
+        about = json.loads((folder / _DESCRIPTION).read_text(encoding="utf-8"))
         kept = {"cardinalities": [int(c) for c in about["cardinalities"]], "n_actions": int(about["n_actions"])}
         return {**kept, "rows": None if about.get("rows") is None else int(about["rows"])}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{folder} is no folder of transitions: its {_ABOUT} cannot be read ({error}).") from error
+        raise ValueError(f"{folder} is not a folder of transitions: its {_DESCRIPTION} cannot be read ({error}).") from error
 
 
-def _begun(folder: Path, cardinalities: tuple[int, ...], n_actions: int, kind: np.dtype[Any]) -> TransitionBatch:
-    """A folder's rows; makes the folder where there is none."""
+def _open_folder(folder: Path, cardinalities: tuple[int, ...], n_actions: int, kind: np.dtype[Any]) -> TransitionBatch:
+    """A folder's rows; creates the folder if it does not exist."""
     about = {"cardinalities": list(cardinalities), "n_actions": n_actions}
     if folder.is_file() or not cardinalities:
         raise ValueError(
-            f"{folder} cannot hold transitions of {len(cardinalities)} factors; give a folder, and a factor at least."
+            f"{folder} cannot hold transitions of {len(cardinalities)} factors; give a folder, and at least one factor."
         )
-    if not (folder / _ABOUT).exists():
-        Path(os.path.realpath(folder)).mkdir(parents=True, exist_ok=True)  # also where a link points to nothing yet
+    if not (folder / _DESCRIPTION).exists():
+        Path(os.path.realpath(folder)).mkdir(parents=True, exist_ok=True)  # also for a link whose target does not exist yet
         for name in _COLUMNS:
             (folder / f"{name}.bin").touch()
         with _locked(folder):
-            if not (folder / _ABOUT).exists():  # another process may have begun it meanwhile, and even written rows
-                files.write(folder / _ABOUT, json.dumps({**about, "rows": _whole_rows(folder, len(cardinalities), kind)}))
-    if {**_about(folder), "rows": None} != {**about, "rows": None}:
+            if not (folder / _DESCRIPTION).exists():  # another process may have created it in the meantime, and even written rows
+                files.write(folder / _DESCRIPTION, json.dumps({**about, "rows": _whole_rows(folder, len(cardinalities), kind)}))
+    if {**_read_description(folder), "rows": None} != {**about, "rows": None}:
         raise ValueError(f"{folder} holds transitions of another environment; choose another folder.")
     return _mapped(folder, len(cardinalities), kind)
 
 
 def _types(kind: np.dtype[Any]) -> dict[str, np.dtype[Any]]:
-    """Type of each column in the files, the lower bytes first."""
+    """Type of each column in the files, little-endian."""
     kinds = {"states": kind, "next_states": kind, "terminated": np.dtype(np.bool_), "rewards": np.dtype(np.float64)}
     return {name: kinds.get(name, np.dtype(np.int64)).newbyteorder("<") for name in _COLUMNS}
 
 
 def _whole_rows(folder: Path, n_factors: int, kind: np.dtype[Any]) -> int:
-    """Number of rows that all files have."""
+    """Number of rows that all column files contain completely."""
     types = _types(kind)
     width = {name: n_factors if name in ("states", "next_states") else 1 for name in _COLUMNS}
     missing = [name for name in _COLUMNS if not (folder / f"{name}.bin").exists()]
     if missing:
-        raise ValueError(f"{folder} is no folder of transitions: it lacks {missing[0]}.bin.")
+        raise ValueError(f"{folder} is not a folder of transitions: it lacks {missing[0]}.bin.")
     return min((folder / f"{name}.bin").stat().st_size // max(1, width[name] * types[name].itemsize) for name in _COLUMNS)
 
 
 def _mapped(folder: Path, n_factors: int, kind: np.dtype[Any]) -> TransitionBatch:
-    """The rows that were written as a whole; what was cut short counts for nothing."""
-    types, columns, written = _types(kind), [], _about(folder)["rows"]
+    """The completely written rows, mapped; rows of an interrupted write are ignored."""
+    types, columns, written = _types(kind), [], _read_description(folder)["rows"]
     n = _whole_rows(folder, n_factors, kind)
     if written is not None and n < written:
         raise ValueError(
             f"{folder} is damaged: a column holds only {n} of the {written} rows written; restore its files from a copy, or set "
-            f"rows to {n} in its {_ABOUT} to go on with those."
+            f"rows to {n} in its {_DESCRIPTION} to go on with those."
         )
     n = n if written is None else written
     for name in _COLUMNS:
@@ -372,7 +372,7 @@ def _mapped(folder: Path, n_factors: int, kind: np.dtype[Any]) -> TransitionBatc
 
 
 def _write(folder: Path, batch: TransitionBatch, n_before: int) -> None:
-    """Adds rows to the files, after the first ``n_before``; they count once ``dataset.json`` says how many there are."""
+    """Writes rows after the first ``n_before``; they become valid when ``dataset.json`` contains the new number of rows."""
     for (name, kind), kept in zip(_types(batch.before.dtype).items(), _KEPT, strict=True):
         values = np.ascontiguousarray(getattr(batch, kept), dtype=kind)
         with (folder / f"{name}.bin").open("r+b") as file:
@@ -381,29 +381,29 @@ def _write(folder: Path, batch: TransitionBatch, n_before: int) -> None:
             file.write(values.data)
             file.flush()
             os.fsync(file.fileno())
-    files.write(folder / _ABOUT, json.dumps({**_about(folder), "rows": n_before + len(batch)}))
+    files.write(folder / _DESCRIPTION, json.dumps({**_read_description(folder), "rows": n_before + len(batch)}))
 
 
 def _locked(folder: Path) -> AbstractContextManager[None]:
-    """Lets one process at a time change a folder."""
+    """Lock under which one process at a time changes a folder."""
     return files.locked(folder / f"{_COLUMNS[0]}.bin")
 
 
 _FLUSH = 256
 
 REUSE_CHANCE = 1e-3
-"""Episodes that all end where the next one starts are reported from this probability on that they do by chance."""
+"""A warning is given if all episodes end in the next one's start state and the probability of that by chance is below this."""
 
 
 class Experience:
-    """All transitions met, with the values of open factors (see FactoredSpace) as declared, so that none is ever lost.
+    """All observed transitions, with the values of open factors (see FactoredSpace) as declared, so that none is lost.
 
     Args:
         space: the observation space, without ``values``.
         n_actions: number of enumerated actions A.
 
     Attributes:
-        dataset: the transitions, numbered as declared.
+        dataset: the transitions, with the values' declared numbers.
     """
 
     def __init__(self, space: FactoredSpace, n_actions: int) -> None:
@@ -412,10 +412,10 @@ class Experience:
         self._coded: tuple[FactoredSpace, int, TransitionDataset] | None = None
 
     def coding(self) -> FactoredSpace:
-        """The space whose open factors are the values met so far, before or after a step.
+        """The space in which open factors have the values observed so far, in states or next states.
 
         Raises:
-            ValueError: a variable took too many values.
+            ValueError: a variable has too many values.
         """
         if not len(self.space.open):
             return self.space
@@ -423,23 +423,23 @@ class Experience:
         return self.space.with_values(np.concatenate([rows.before, rows.after]))
 
     def coded(self, space: FactoredSpace) -> TransitionDataset:
-        """The transitions in the factors of ``space``; the dataset itself where no factor is open."""
+        """The transitions in the factors of ``space``; the dataset itself if no factor is open."""
         if space.values is None or not len(space.open):
             return self.dataset
-        n_met = len(self.dataset)
-        if self._coded is None or self._coded[0] is not space or self._coded[1] != n_met:
+        n_rows = len(self.dataset)
+        if self._coded is None or self._coded[0] is not space or self._coded[1] != n_rows:
             rows, coded = self.dataset.rows(), TransitionDataset(space.cardinalities, self.dataset.n_actions)
             coded.append(replace(rows, before=space.narrow(rows.states), after=space.narrow(rows.next_states)))
-            self._coded = (space, n_met, coded)
+            self._coded = (space, n_rows, coded)
         return self._coded[2]
 
 
 class ExperienceRecorder:
-    """Collects the steps of ``n_envs`` environments that reset themselves, as SB3's VecEnv do.
+    """Records the steps of ``n_envs`` environments that reset themselves, as those of SB3's VecEnv do.
 
     Args:
         space: the observation space, without ``values``.
-        dataset: where transitions go.
+        dataset: receives the transitions.
         n_envs: number of environments B.
 
     Attributes:
@@ -458,7 +458,7 @@ class ExperienceRecorder:
         self.states: States | None = None
 
     def reset(self, obs: Any) -> None:
-        """Every environment starts a new episode at ``obs`` (batched)."""
+        """Starts a new episode in every environment, with the observations ``obs`` (batched)."""
         with blaming_environment():
             self.states = self._space.encode(obs)
         self._begin(np.arange(len(self.states)))
@@ -477,21 +477,24 @@ class ExperienceRecorder:
         dones: NDArray[Any],
         infos: list[dict[str, Any]],
     ) -> TransitionBatch:
-        """Adds one step of every environment, and returns it, [B].
+        """Adds one step of every environment, and returns these transitions, [B].
 
         Args:
             actions: int64 [B], numbers of the enumerated actions.
-            new_obs: what the vector environment returned: where an episode ended, already the next one's first.
+            new_obs: observations as returned by the vector environment: after the end of an episode, the next one's first.
             rewards: float [B].
             dones: bool [B].
-            infos: SB3's: the true last observation is in ``terminal_observation``, a truncation in
+            infos: as in SB3: the last observation of an episode is in ``terminal_observation``, a truncation in
                 ``TimeLimit.truncated``.
+
+        Raises:
+            ValueError: a reward or an observation is invalid, or ``infos`` lacks a last observation.
         """
         assert self.states is not None
         if not np.isfinite(rewards).all():
             raise ValueError(
                 "The environment returned a reward of NaN or infinity, or one beyond 3.4e38, which is more than the float32 of "
-                "vector environments can hold; mend the environment or wrap its rewards."
+                "vector environments can hold; fix the environment or wrap its rewards."
             )
         ended, terminated = np.flatnonzero(dones), np.array(dones, dtype=np.bool_)
         with blaming_environment():
@@ -511,7 +514,7 @@ class ExperienceRecorder:
             actions.astype(np.int64),
             next_states,
             terminated,
-            np.array(rewards, dtype=np.float64),  # copied: the vector environment may use its arrays again
+            np.array(rewards, dtype=np.float64),  # copied, since the vector environment may reuse its arrays
             self._episodes.copy(),
         )
         self._steps.append(step)
@@ -524,16 +527,17 @@ class ExperienceRecorder:
         return step
 
     def flush(self) -> None:
-        """Hands what was collected to the dataset."""
+        """Appends the recorded steps to the dataset."""
         if self._steps:
             names = ("states", "actions", "next_states", "terminated", "rewards", "episodes")
             self._dataset.append(TransitionBatch(*(np.concatenate([getattr(s, n) for s in self._steps]) for n in names)))
             self._steps = []
 
     def warn_of_reused_arrays(self) -> None:
-        """Warns, once, where last observations of episodes seem to be overwritten by the resets that follow.
+        """Warns, once, if the last observations of episodes appear to be overwritten by the following resets.
 
-        That is so where all of them are the next episode's first, which is improbable by how often that one is observed.
+        This is assumed if each of them equals the next episode's first observation, and this is improbable by chance, given
+        how often these start states are observed.
         """
         if not self._ends_at_starts or len(self._starts) < 2 or isinstance(self._space.space, spaces.Discrete):
             return  # numbers cannot be overwritten
@@ -551,25 +555,25 @@ class ExperienceRecorder:
         )
 
     def starts(self) -> States:
-        """Distinct start states met so far, int64 [S, F], in the order met."""
+        """Distinct start states observed so far, int64 [S, F], in order of first appearance."""
         starts = np.concatenate(self._starts) if self._starts else np.zeros((0, len(self._space)), dtype=np.int64)
         return distinct_rows(starts)
 
 
 def warn_of_forgetting(learned: bool, data: TransitionDataset) -> None:
-    """Warns where the next fit would replace what an agent has learned: transitions that it was fitted to are not at hand."""
+    """Warns if the next fit would discard the learned weights because the transitions they were fitted to are not available."""
     if learned and not len(data):
         warnings.warn(
             "This agent has weights, but not the transitions that they were learned from (it was loaded, or given weights), so "
-            "learn() will replace what it knows by what the new steps tell. Save agents with include=['transitions'], or call "
-            "load_transitions(path) first.",
+            "learn() will replace what it knows by a fit to the new steps only. Save agents with include=['transitions'], or "
+            "call load_transitions(path) first.",
             UserWarning,
             stacklevel=3,
         )
 
 
 def distinct_rows(rows: States) -> States:
-    """The distinct rows [S, F] of [N, F], in the order of their first appearance."""
+    """The distinct rows [S, F] of [N, F], in order of first appearance."""
     if len(rows) == 0:
         return rows
     _, first = np.unique(rows, axis=0, return_index=True)

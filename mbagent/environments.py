@@ -1,7 +1,7 @@
-"""How environments become the VecEnv that the agent steps, in this process or in processes of their own.
+"""Wrapping of environments as the VecEnv that the agent steps, in this process or in subprocesses.
 
-Observations keep the environment's own layout. A worker process of SB3's SubprocVecEnv ends with its first error, be it a missing
-attribute or one that cannot be pickled, so workers are asked only for what is known to exist.
+Observations keep the environment's own layout. A worker process of SB3's SubprocVecEnv terminates at its first error, for example
+a missing attribute or one that cannot be pickled, so only attributes that are known to exist are requested from workers.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from mbagent.spaces import ActionEnumeration, FactoredSpace, OutsideSpaceError, 
 
 
 def wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-    """As SB3 wraps environments, but without moving the channels of image-like observations.
+    """Wraps environments as SB3 does, but without transposing the channels of image-like observations.
 
     Raises:
-        TypeError: it is no environment that SB3 takes; or the observation space is nested deeper than SB3's vector
-            environments can carry, see wrappers.Flat.
-        ValueError: it normalizes observations.
+        TypeError: SB3 does not support this kind of environment; or the observation space is nested more deeply than SB3's
+            vector environments support, see wrappers.Flat.
+        ValueError: the environment normalizes observations.
     """
     if not isinstance(env, VecEnv):
         _refuse_others(env)
         env = _patch_env(env)
-        FactoredSpace(env.observation_space)  # refuses in one sentence what SB3's wrapper would stumble over
+        FactoredSpace(env.observation_space)  # raises a clear error before SB3's wrapper fails with another one
         ActionEnumeration(env.action_space)
         _refuse_nested(env.observation_space)
         env = Guarded(env)
@@ -58,10 +58,10 @@ def wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> Vec
 
 
 class Guarded(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
-    """An environment whose results are checked, and copied, so that it may use its arrays and dicts again.
+    """An environment whose results are checked and copied, so that it may reuse its arrays and dicts.
 
-    SB3 keeps the last observation of an episode while the environment is reset; without a copy, a reset that clears the
-    environment's own array would turn it into the first of the next.
+    SB3 keeps the last observation of an episode while the environment is reset; without a copy, a reset that overwrites the
+    environment's own array would replace that observation by the first one of the next episode.
 
     Args:
         env: an environment with discrete spaces (see FactoredSpace).
@@ -77,33 +77,33 @@ class Guarded(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
         """See gymnasium.Env.
 
         Raises:
-            TypeError, ValueError: the environment returned something else than it should.
+            TypeError, ValueError: the environment returned values of the wrong type, number or range.
         """
-        obs, info = self._parts(self.env.reset(seed=seed, options=options), "reset", "(observation, info)", 2)
-        return self._own(obs), self._copied(info)
+        obs, info = self._checked_tuple(self.env.reset(seed=seed, options=options), "reset", "(observation, info)", 2)
+        return self._checked_copy(obs), self._copied(info)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """As ``reset``."""
+        """See gymnasium.Env; raises as ``reset``."""
         names = "(observation, reward, terminated, truncated, info)"
-        obs, reward, terminated, truncated, info = self._parts(self.env.step(action), "step", names, 5)
+        obs, reward, terminated, truncated, info = self._checked_tuple(self.env.step(action), "step", names, 5)
         try:
             float(reward)
         except (TypeError, ValueError) as error:
             raise TypeError(
                 f"The environment's step returned the reward {reward!r} instead of one number; fix the environment."
             ) from error
-        return self._own(obs), reward, terminated, truncated, self._copied(info)
+        return self._checked_copy(obs), reward, terminated, truncated, self._copied(info)
 
     @staticmethod
-    def _parts(returned: Any, method: str, names: str, n: int) -> tuple[Any, ...]:
+    def _checked_tuple(returned: Any, method: str, names: str, n: int) -> tuple[Any, ...]:
         if isinstance(returned, tuple) and len(returned) == n:
             return returned
         got = f"{len(returned)} values" if isinstance(returned, tuple) else repr(returned)
         raise TypeError(f"The environment's {method} returned {got} instead of Gymnasium's {names}; fix the environment.")
 
-    def _own(self, obs: Any) -> Any:
+    def _checked_copy(self, obs: Any) -> Any:
         space = self._space.space
-        if isinstance(obs, list) or not space.contains(obs):  # the space's own check is quick, but refuses other data types
+        if isinstance(obs, list) or not space.contains(obs):  # the space's own check is fast, but rejects other data types
             with blaming_environment():
                 self._space.encode(one_as_batch(space, obs))
         return deepcopy(obs)
@@ -117,10 +117,10 @@ class Guarded(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
 
 @contextmanager
 def blaming_environment() -> Iterator[None]:
-    """Observations that do not fit their space are the environment's mistake here, and errors say so.
+    """Attributes observations outside their space to the environment, in the error message.
 
     Raises:
-        ValueError: one did not fit.
+        ValueError: an observation was outside the observation space.
     """
     try:
         yield
@@ -159,12 +159,12 @@ ENDED = (
 )
 
 LOOK_EVERY = 1.0
-"""Seconds without an answer after which it is checked whether the process still runs."""
+"""Seconds without an answer after which is checked whether the process is still running."""
 
 
 @contextmanager
 def naming_ended_processes(env: VecEnv) -> Iterator[None]:
-    """Says in a sentence what the error of a broken pipe means; errors of environments in this process pass unchanged.
+    """Replaces the error of a broken pipe by one that explains it; errors of environments in this process pass unchanged.
 
     Raises:
         RuntimeError: a process of ``env`` has ended; the cause is the error of its pipe.
@@ -178,7 +178,7 @@ def naming_ended_processes(env: VecEnv) -> Iterator[None]:
 
 
 def has_ended(env: VecEnv) -> bool:
-    """Whether the environments are in processes of their own of which one has ended, or owes an answer that nobody waits for."""
+    """Whether the environments run in subprocesses of which one has ended, or has an unread answer from an interrupted step."""
     inner = env.unwrapped
     try:
         return isinstance(inner, SubprocVecEnv) and any(remote.poll() for remote in inner.remotes)
@@ -187,7 +187,7 @@ def has_ended(env: VecEnv) -> bool:
 
 
 def step(env: VecEnv, actions: Any) -> tuple[Any, Any, Any, Any]:
-    """As ``env.step``, for environments of which a process may end.
+    """``env.step`` for environments in subprocesses that may end.
 
     Raises:
         RuntimeError: a process has ended.
@@ -197,7 +197,7 @@ def step(env: VecEnv, actions: Any) -> tuple[Any, Any, Any, Any]:
         return env.step(actions)
     with naming_ended_processes(env):
         env.step_async(actions)
-        # Forked processes hold each other's pipes open, so that reading from one that has ended could wait for ever.
+        # Forked processes keep each other's pipes open, so reading from a process that has ended could block forever.
         for remote, process in zip(inner.remotes, inner.processes, strict=True):
             while not remote.poll(LOOK_EVERY):
                 if not process.is_alive():
@@ -206,7 +206,7 @@ def step(env: VecEnv, actions: Any) -> tuple[Any, Any, Any, Any]:
 
 
 def own_reward(env: VecEnv) -> tuple[Any, str]:
-    """The ``reward_fn`` of the first environment or None, and what to say where it is None."""
+    """The ``reward_fn`` of the first environment or None, and the reason (the beginning of a sentence) if it is None."""
     missing = "The environment has no reward_fn"
     alone = not isinstance(env.unwrapped, SubprocVecEnv)
     try:
@@ -214,10 +214,10 @@ def own_reward(env: VecEnv) -> tuple[Any, str]:
             return None, missing
         if alone or env.env_method("has_wrapper_attr", _IfPicklable("reward_fn"), indices=0)[0]:
             return env.get_attr("reward_fn", indices=0)[0], missing
-    except Exception as error:  # it has none, cannot be unpickled here, or the process has ended, which ``learn`` will tell
+    except Exception as error:  # missing, cannot be unpickled here, or the process has ended, which ``learn`` will report
         if alone and isinstance(error, AttributeError):
             return None, missing
-        if alone:  # an error of its own
+        if alone:  # an error raised by the attribute itself
             return None, f"The environment's reward_fn cannot be read ({type(error).__name__}: {error})"
     return None, (
         "The environment's reward_fn cannot be pickled, as it must be to leave the environment's process (to plan with it, give "
@@ -226,7 +226,7 @@ def own_reward(env: VecEnv) -> tuple[Any, str]:
 
 
 class _IfPicklable:
-    """The name of an attribute; the environment's process receives an empty one if the attribute's value cannot be pickled."""
+    """The name of an attribute; the subprocess receives an empty name instead if the attribute's value cannot be pickled."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -236,7 +236,7 @@ class _IfPicklable:
 
 
 def _if_picklable(name: str) -> str:
-    # SB3's worker has no command that would tell. It unpickles a command's arguments in the function whose ``env`` is asked for.
+    # SB3's worker has no command for this. It unpickles a command's arguments inside the function that has the variable ``env``.
     frame = sys._getframe()
     while frame.f_back is not None and not isinstance(frame.f_locals.get("env"), gym.Env):
         frame = frame.f_back
@@ -248,7 +248,7 @@ def _if_picklable(name: str) -> str:
 
 
 class EnvironmentAlgorithm(BaseAlgorithm):
-    """SB3's base algorithm for environments whose steps or processes may fail, and for files without code."""
+    """SB3's base algorithm, adapted to environments whose steps or processes may fail, and to files without code."""
 
     _recorder: Any = None
 
@@ -264,7 +264,7 @@ class EnvironmentAlgorithm(BaseAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        """As SB3's; but for no steps at all an environment that has failed is left alone."""
+        """SB3's setup; but if no steps are requested, a failed environment is not used."""
         assert self.env is not None
         rest = tb_log_name, progress_bar
         ended = has_ended(self.env)
@@ -275,7 +275,7 @@ class EnvironmentAlgorithm(BaseAlgorithm):
                 return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *rest)
         if reset_num_timesteps:
             self.num_timesteps = self._episode_num = 0
-        self._last_obs = np.zeros(0)  # one must be there for SB3 not to reset the environment
+        self._last_obs = np.zeros(0)  # SB3 would reset the environment if this were None
         try:
             return super()._setup_learn(0, callback, False, *rest)
         finally:

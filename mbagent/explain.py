@@ -1,4 +1,4 @@
-"""Why an agent takes an action: what its planner found for one observation, and the futures it imagines."""
+"""Explanations of an agent's action: the planner's results for one observation, and the most probable futures."""
 
 from __future__ import annotations
 
@@ -19,25 +19,26 @@ from mbagent.types import Floats, States
 from mbagent_envs.random_keys import derive
 
 REPEATS = 8
-"""Decisions with different random numbers that the standard errors come from."""
+"""Number of decisions with different random numbers from which standard errors are computed."""
 
 SHORT = 24
-"""Observations whose text is at most this long stand in ``Explanation.table``."""
+"""Observations are shown in ``Explanation.table`` if their text is at most this long."""
 
 _OTHER_SEEDS = 0xE59A1
 
 
 @dataclass(frozen=True)
 class Step:
-    """One imagined step.
+    """One simulated step.
 
     Attributes:
         action: the action, in the action space's own form.
-        observation: the observation it leads to, in the observation space's own form.
-        probability: of this observation after the one before and the action, as imagined: where a model draws successors
-            instead of listing them, the share of the planner's draws (of 4, say: one of a thousand new mazes has 25% then).
-        reward: of this step, under the goal.
-        terminated: whether the episode ends with it.
+        observation: the next observation, in the observation space's own form.
+        probability: probability of this observation given the previous one and the action, as used by the planner. If the model
+            samples successors instead of listing them, this is the share of the samples (with 4 samples, one of a thousand
+            possible new mazes has 25%).
+        reward: reward of this step, under the goal.
+        terminated: whether the step ends the episode.
     """
 
     action: Any
@@ -49,11 +50,11 @@ class Step:
 
 @dataclass(frozen=True)
 class Future:
-    """One way things may go.
+    """One possible trajectory.
 
     Attributes:
-        steps: at least one.
-        probability: of all of them, the product of theirs.
+        steps: at least one step.
+        probability: product of the steps' probabilities.
     """
 
     steps: tuple[Step, ...]
@@ -62,7 +63,7 @@ class Future:
 
 @dataclass(frozen=True)
 class Explanation:
-    """What the planner found for one observation; A actions, in the order of their numbers.
+    """The planner's results for one observation; A actions, in the order of their numbers.
 
     Observations are in the observation space's own form, so that a game can draw them::
 
@@ -74,26 +75,26 @@ class Explanation:
             print(step.action, step.reward, draw_ansi(env.unwrapped.game.scene(step.observation)))
 
     Attributes:
-        observation: what was explained.
+        observation: the explained observation.
         actions: the actions [A], in the action space's own form.
         best: row of the action that ``predict`` takes.
-        values: float64 [A], estimated discounted return of each action with the best behaviour found after it (flat Monte
-            Carlo: with random play).
+        values: float64 [A], estimated discounted return of each action, followed by the planner's best policy (flat Monte
+            Carlo: by random play).
         errors: float64 [A], standard errors of the values: the standard deviation (ddof=1) over ``REPEATS`` decisions that
-            differ in the planner's random numbers only. They tell how much is due to the luck of simulations and drawn
-            successors, 0 where neither plays a part; how wrong the model is, they cannot tell (see models.trust).
-        chosen: float64 [A], share of these decisions that took the action. Luck is shared between the actions of a decision,
-            so this says more about the choice than errors that overlap.
-        visits: float64 [A], simulations through each action; all 0 where none were made: with the ValueIterationPolicy, and
-            wherever the whole machine is solved.
-        machine_states: number of states of the reachable machine if it was solved as a whole; 0 if it is too large.
-        futures: for each action its likeliest imagined futures, the likeliest first. After the action they follow the
-            best behaviour found (with flat Monte Carlo, which has none, they are one step long).
-        rare: for each action the outcomes less probable than ``RARE_VALUE`` that take part in its value, those first that change
-            it most (with flat Monte Carlo, which has no values of them, the least likely first). Probabilities are posterior
-            means, of counts where the model is learned from counts.
-        effects: for each of these, what it adds to the action's value, compared with an outcome as good as the others are on
-            average; 0 with flat Monte Carlo.
+            differ only in the planner's random numbers. They measure the randomness of simulations and sampled successors (0
+            if there is neither), but not the error of the model (see models.model_error).
+        chosen: float64 [A], share of these decisions that took the action. Since the actions of a decision share random
+            numbers, this is more informative about the choice than overlapping errors.
+        visits: float64 [A], simulations through each action; all 0 if there were none, as with the ValueIterationPolicy, or
+            if the whole MDP is solved.
+        machine_states: number of states of the reachable MDP if it was solved completely; 0 if it is too large.
+        futures: for each action its most probable simulated futures, in decreasing order. After the action they follow the
+            planner's best policy (with flat Monte Carlo, which has none, they are one step long).
+        rare: for each action the outcomes less probable than ``RARE_VALUE`` that contribute to its value, in decreasing order
+            of their effect (with flat Monte Carlo, which does not value them, in increasing order of probability).
+            Probabilities are posterior means if the model is learned from counts.
+        effects: for each of these, its contribution to the action's value, compared with the average of the other outcomes; 0
+            with flat Monte Carlo.
     """
 
     observation: Any
@@ -112,7 +113,7 @@ class Explanation:
         """The best actions and their futures, as text.
 
         Args:
-            n_actions: rows, at most; the action taken comes first, the others by value.
+            n_actions: largest number of actions shown; the chosen action is first, followed by the others in order of value.
         """
         rest = [int(a) for a in np.argsort(-self.values, kind="stable") if a != self.best]
         rows = [self.best, *rest][: max(n_actions, 1)]
@@ -124,31 +125,31 @@ class Explanation:
             lines.append(f"{names[a]:>{width}}{figures}{'  <- taken' if a == self.best else ''}")
         for a in rows:
             lines.append(f"likeliest futures of action {names[a]}:")
-            lines += [f"  {future.probability:6.1%}  {_described(future)}" for future in self.futures[a]]
+            lines += [f"  {future.probability:6.1%}  {_as_text(future)}" for future in self.futures[a]]
             for step, effect in zip(self.rare[a], self.effects[a], strict=True):
                 lines.append(
-                    f"  {step.probability:6.2g}  {_described(Future((step,), step.probability))}: rare, {effect:+.3g} in value"
+                    f"  {step.probability:6.2g}  {_as_text(Future((step,), step.probability))}: rare, {effect:+.3g} in value"
                 )
         return "\n".join(lines)
 
     def _headline(self) -> str:
         if self.machine_states:
-            return f"The reachable machine of {self.machine_states:,} states is solved as a whole; nothing was searched."
-        return f"{self.visits.sum():.0f} simulations." if self.visits.any() else "Values of a machine imagined around the state."
+            return f"The reachable MDP of {self.machine_states:,} states is solved completely; no search was needed."
+        return f"{self.visits.sum():.0f} simulations." if self.visits.any() else "Values of a lookahead around the state."
 
 
 def explain(policy: PlannerPolicy, observation: Any, n_futures: int = 3, n_steps: int = 10) -> Explanation:
-    """What a policy's planner finds for one observation; see ``ModelLearningAgent.explain``."""
+    """An explanation of a policy's action for one observation; see ``ModelLearningAgent.explain``."""
     for name, value in (("n_futures", n_futures), ("n_steps", n_steps)):
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
             raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}.")
     with policy.lock.planning():
-        return _explained(policy, observation, n_futures, n_steps)
+        return _explanation(policy, observation, n_futures, n_steps)
 
 
-def _explained(policy: PlannerPolicy, observation: Any, n_futures: int, n_steps: int) -> Explanation:
+def _explanation(policy: PlannerPolicy, observation: Any, n_futures: int, n_steps: int) -> Explanation:
     state = _single_state(policy, observation)
-    # A deadline, or the last decision's tree, would make two explanations of one observation differ.
+    # A time budget or the last decision's tree would make explanations irreproducible.
     settings = replace(policy.settings, time_budget=None, reuse_tree=False)
     planner = _planner(policy, settings, policy.planner)
     found = _trace(planner, state)
@@ -160,7 +161,7 @@ def _explained(policy: PlannerPolicy, observation: Any, n_futures: int, n_steps:
         actions=policy.actions.decode(np.arange(policy.actions.n)),
         best=taken[0],
         values=found.plan.values[0],
-        errors=(values - values[0]).std(axis=0, ddof=1),  # exactly 0 where all are equal
+        errors=(values - values[0]).std(axis=0, ddof=1),  # exactly 0 if all are equal
         chosen=np.bincount(taken, minlength=policy.actions.n) / len(taken),
         visits=found.plan.visits[0],
         machine_states=found.machine_states,
@@ -170,7 +171,7 @@ def _explained(policy: PlannerPolicy, observation: Any, n_futures: int, n_steps:
 
 
 def _single_state(policy: PlannerPolicy, observation: Any) -> States:
-    """The observation as factors [1, F], if there is something to explain."""
+    """The observation as factors [1, F]; ValueError if the agent cannot plan for it."""
     if not policy.fitted:
         raise ValueError("This agent has learned nothing yet, so there is nothing to explain; call learn() first.")
     if policy.goal is None:
@@ -182,10 +183,10 @@ def _single_state(policy: PlannerPolicy, observation: Any) -> States:
 
 
 def _planner(policy: PlannerPolicy, settings: PlannerSettings, like: Planner) -> Planner:
-    """A planner of its own, so that the policy's is left as it is; it looks ahead as another one does."""
+    """A new planner with the lookahead configuration of ``like``, so that the policy's own planner is not changed."""
     planner = policy.planner_class(settings)
     planner.set_model(policy.transition_model, policy.start_states)
-    assert policy.goal is not None  # ``_single_state`` has seen to it
+    assert policy.goal is not None  # checked in ``_single_state``
     planner.set_goal(policy.goal)
     if isinstance(planner, ValueIterationPlanner) and isinstance(like, ValueIterationPlanner):
         planner.share_config(like)
@@ -194,7 +195,7 @@ def _planner(policy: PlannerPolicy, settings: PlannerSettings, like: Planner) ->
 
 def _trace(planner: Planner, state: States) -> PlanTrace:
     if not isinstance(planner, TracingPlanner):
-        raise TypeError(f"explain() needs a planner with foresee(root), which {type(planner).__name__} has not.")
+        raise TypeError(f"explain() needs a planner with trace(root), which {type(planner).__name__} does not have.")
     return planner.trace(state)
 
 
@@ -209,7 +210,7 @@ def _other_values(policy: PlannerPolicy, settings: PlannerSettings, state: State
 
 
 def _steps(policy: PlannerPolicy, found: PlanTrace, edges: Sequence[int]) -> tuple[Step, ...]:
-    """What some edges of the graph stand for."""
+    """The steps that edges of the state graph represent."""
     if len(edges) == 0:
         return ()
     graph, actions = found.graph, policy.actions.decode(np.arange(policy.actions.n))
@@ -235,7 +236,7 @@ def _futures(policy: PlannerPolicy, found: PlanTrace, n_futures: int, n_steps: i
 
 
 def _rare(policy: PlannerPolicy, found: PlanTrace, most: int) -> dict[str, Any]:
-    """``rare`` and ``effects`` of Explanation, ``most`` of each action."""
+    """``rare`` and ``effects`` of Explanation, at most ``most`` for each action."""
     graph, steps, effects = found.graph, [], []
     for first, count in zip(graph.first[found.root], graph.counts[found.root], strict=True):
         edges = np.arange(first, first + count)
@@ -253,7 +254,7 @@ def _rare(policy: PlannerPolicy, found: PlanTrace, most: int) -> dict[str, Any]:
 
 
 def _row(batch: Any, index: int) -> Any:
-    """One observation of a batch laid out as ``batch_space`` does."""
+    """One observation of a batch in the form of ``batch_space``."""
     if isinstance(batch, Mapping):
         return {key: _row(part, index) for key, part in batch.items()}
     if isinstance(batch, tuple):
@@ -261,8 +262,8 @@ def _row(batch: Any, index: int) -> Any:
     return batch[index]
 
 
-def _described(future: Future) -> str:
-    """A future as a line: actions, short observations, rewards other than 0, the end."""
+def _as_text(future: Future) -> str:
+    """A future as a line of text: actions, short observations, non-zero rewards, termination."""
     parts = []
     for step in future.steps:
         seen = _text(step.observation)

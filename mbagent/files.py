@@ -1,10 +1,10 @@
-"""Files that are whole or not there: written under another name in the same folder, flushed to the disk, then renamed.
+"""Atomic writing of files: written under a temporary name in the same folder, flushed to the disk, then renamed.
 
-A file that is being written is locked (``flock``), and whoever saves at the same path later removes those that nobody has locked:
-they are of writers that were killed. The operating system frees a lock when its process ends, however it ends. So locks tell live
-from dead in other containers, too, where process numbers mean nothing, and on other machines if the file system carries locks;
-and no slow writer is taken for a dead one, as by an age. Where there are no such locks (Windows, some network file systems) files
-are as safe, but what killed writers leave is not removed.
+A file that is being written is locked (``flock``). A later call for the same path removes temporary files that are not locked,
+since their writers were killed: the operating system releases a lock when its process ends for any reason. Unlike process
+numbers, locks work across containers, and on network file systems that support locks; unlike an age limit, they never remove the
+file of a slow writer. Without such locks (Windows, some network file systems) files are equally safe, but temporary files of
+killed writers are not removed.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ if sys.platform != "win32":
     import fcntl
 
 Target = str | os.PathLike[str] | BinaryIO
-"""Where to save to or load from: a path or an open binary file."""
+"""Destination or source of a file: a path or an open binary file."""
 
 
 def write(path: Path, content: str | bytes) -> None:
-    """Writes a whole file; text as UTF-8, its line ends as they are.
+    """Writes a complete file; text as UTF-8, with line endings unchanged.
 
     Raises:
         OSError: see ``replaced``.
@@ -44,11 +44,11 @@ def write(path: Path, content: str | bytes) -> None:
 
 
 def writing(target: Target, suffix: str, *, always: bool) -> AbstractContextManager[BinaryIO]:
-    """A file to write to: an open one as it is, or the whole of the one at a path.
+    """A file to write to: an open file unchanged, or one that replaces the file at a path.
 
     Args:
         target: the path or the open file.
-        suffix: what is appended to the path.
+        suffix: suffix to append to the path.
         always: append it unless the path ends with it, as NumPy does; else only to a path without any suffix, as SB3 does.
 
     Raises:
@@ -63,11 +63,11 @@ def writing(target: Target, suffix: str, *, always: bool) -> AbstractContextMana
 
 
 def reading(source: Target, suffix: str) -> AbstractContextManager[BinaryIO]:
-    """A file to read: an open one as it is, or that at a path, with ``suffix`` appended where there is none without.
+    """A file to read: an open file unchanged, or the file at a path, or at the path with ``suffix``.
 
     Raises:
         TypeError, ValueError: ``source`` is neither.
-        FileNotFoundError: there is none; the message names the paths tried.
+        FileNotFoundError: there is no such file; the message names the paths tried.
     """
     if _is_open(source, "read"):
         return nullcontext(source)
@@ -83,25 +83,25 @@ def arrays(file: BinaryIO) -> dict[str, NDArray[Any]]:
     """The arrays of an ``.npz``.
 
     Raises:
-        ValueError: it is none, is damaged, or holds pickles. NumPy's own message is left out: it may advise to allow pickles,
-            which run code when read.
+        ValueError: the file is not an ``.npz``, is damaged, or contains pickles. NumPy's own message is omitted, since it may
+            suggest allowing pickles, which run code when read.
     """
     try:
         with np.load(file, allow_pickle=False) as archive:
             return {name: np.asarray(archive[name]) for name in archive.files}
     except (ValueError, EOFError, TypeError, AttributeError, KeyError, zipfile.BadZipFile, zlib.error):
-        raise ValueError("it is no .npz of plain arrays or is damaged") from None
+        raise ValueError("it is not an .npz of plain arrays, or is damaged") from None
 
 
 def _is_open(target: Any, method: str) -> TypeGuard[BinaryIO]:
-    """Whether it is an open binary file."""
+    """Whether ``target`` is an open binary file; TypeError if it is an open text file."""
     if isinstance(target, io.TextIOBase):
         raise TypeError("The file is open in text mode; open it in binary mode ('wb' to save, 'rb' to load), or pass its path.")
     return hasattr(target, method) and not isinstance(target, str | os.PathLike)
 
 
 def _checked(target: Any) -> Path:
-    """The path of a file."""
+    """The path of a file; TypeError or ValueError if ``target`` is not one."""
     if not isinstance(target, str | os.PathLike):
         raise TypeError(f"Files are saved to and loaded from a path or an open binary file, got {target!r}.")
     path = Path(target)
@@ -112,30 +112,30 @@ def _checked(target: Any) -> Path:
 
 @contextmanager
 def replaced(path: Path) -> Iterator[BinaryIO]:
-    """A new binary file that takes the place of ``path`` when the block ends: whatever interrupts it, the old one is still there.
+    """A new binary file that replaces ``path`` when the block ends; if the block is interrupted, the old file is kept.
 
-    Missing folders are made, symbolic links followed, and the permissions of a file that was there before are kept.
+    Missing folders are created, symbolic links are followed, and the permissions of an existing file are kept.
 
     Raises:
-        IsADirectoryError, NotADirectoryError: there is a folder at the path, or a file where its folder should be.
-        PermissionError: the folder or the file must not be written to.
-        OSError: another reason, such as a full disk.
+        IsADirectoryError, NotADirectoryError: there is a folder at the path, or a file in place of its folder.
+        PermissionError: the folder or the file is not writable.
+        OSError: any other failure, such as a full disk.
     """
     path = Path(os.path.realpath(path))
-    before = _before(path)
+    before = _prepare(path)
     _remove_abandoned(path)
-    with _explained(path):
-        temporary, file = _begun(path)
+    with _explain_permissions(path):
+        temporary, file = _create_temporary(path)
     try:
         with file:
             yield file
             if before is not None:
-                _like(temporary, before)
+                _copy_permissions(temporary, before)
             file.flush()
             os.fsync(file.fileno())
-            if sys.platform == "win32":  # which renames no open file; elsewhere it stays open, and so locked, until it is renamed
+            if sys.platform == "win32":  # cannot rename open files; elsewhere the file stays open, hence locked, until then
                 file.close()
-            with _explained(path):
+            with _explain_permissions(path):
                 temporary.replace(path)
     except BaseException:
         temporary.unlink(missing_ok=True)
@@ -143,10 +143,10 @@ def replaced(path: Path) -> Iterator[BinaryIO]:
     _sync(path.parent)
 
 
-def _before(path: Path) -> os.stat_result | None:
-    """What is known of the file that will be replaced; None where there is none. Makes its folder."""
+def _prepare(path: Path) -> os.stat_result | None:
+    """Status of the file to be replaced; None if there is none. Creates the folder."""
     try:
-        with _explained(path):
+        with _explain_permissions(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             before = path.stat()
     except FileNotFoundError:
@@ -163,8 +163,8 @@ def _before(path: Path) -> os.stat_result | None:
 
 
 @contextmanager
-def _explained(path: Path) -> Iterator[None]:
-    """Says why a file that may itself be writable cannot be replaced."""
+def _explain_permissions(path: Path) -> Iterator[None]:
+    """Explains why a file that may itself be writable cannot be replaced."""
     try:
         yield
     except OSError as error:
@@ -176,8 +176,8 @@ def _explained(path: Path) -> Iterator[None]:
         ) from error
 
 
-def _begun(path: Path) -> tuple[Path, BinaryIO]:
-    """A new, locked file of a unique name beside ``path``, with the permissions that any new file gets there."""
+def _create_temporary(path: Path) -> tuple[Path, BinaryIO]:
+    """A new, locked file with a unique name in the folder of ``path``, with the default permissions of new files."""
     while True:
         temporary = path.with_name(f"{_prefix(path)}{uuid.uuid4().hex}.part")
         file = temporary.open("xb")
@@ -185,16 +185,16 @@ def _begun(path: Path) -> tuple[Path, BinaryIO]:
             _lock(file, wait=True)
         if temporary.exists():
             return temporary, file
-        file.close()  # taken for abandoned between being created and being locked
+        file.close()  # removed by another process between creation and locking
 
 
 def _prefix(path: Path) -> str:
-    """How the names of temporary files begin; file systems allow names 255 bytes."""
+    """Prefix of the names of temporary files, shortened since file systems limit names to 255 bytes."""
     return f".{os.fsencode(path.name)[:200].decode(errors='ignore')}."
 
 
 def _remove_abandoned(path: Path) -> None:
-    """Removes what killed writers to ``path`` have left."""
+    """Removes temporary files left by killed writers to ``path``."""
     pattern = re.compile(rf"{re.escape(_prefix(path))}[0-9a-f]{{32}}\.part")
     with suppress(OSError):
         for other in [other for other in path.parent.iterdir() if pattern.fullmatch(other.name)]:
@@ -207,7 +207,7 @@ def _lock(file: BinaryIO, *, wait: bool) -> None:
     """Locks a file until it is closed.
 
     Raises:
-        OSError: another has locked it, or there are no locks.
+        OSError: another process has locked it, or locks are not supported.
     """
     if sys.platform == "win32":
         raise OSError(errno.ENOTSUP, "no locks")
@@ -216,15 +216,15 @@ def _lock(file: BinaryIO, *, wait: bool) -> None:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Lets one process at a time in: those that lock the same file wait; nobody waits where there are no locks."""
+    """Holds an exclusive lock on a file during the block; has no effect if locks are not supported."""
     with path.open("r+b") as file:
         with suppress(OSError):
             _lock(file, wait=True)
         yield
 
 
-def _like(path: Path, before: os.stat_result) -> None:
-    """Gives a file the permissions of another, and where this is allowed its owner."""
+def _copy_permissions(path: Path, before: os.stat_result) -> None:
+    """Gives a file the permissions of another and, if allowed, its owner."""
     if sys.platform != "win32":
         with suppress(OSError):
             os.chown(path, before.st_uid, before.st_gid)
@@ -232,7 +232,7 @@ def _like(path: Path, before: os.stat_result) -> None:
 
 
 def _sync(folder: Path) -> None:
-    """Flushes a folder's names to the disk; some systems cannot, and the file is whole under either name."""
+    """Flushes a folder's entries to the disk, if supported; the file is complete under either name in any case."""
     with suppress(OSError):
         number = os.open(folder, os.O_RDONLY)
         try:

@@ -1,4 +1,4 @@
-"""What an agent has learned, had back as a Gymnasium environment: any algorithm can be trained in it."""
+"""The learned model as a Gymnasium environment, in which any algorithm can be trained."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ if TYPE_CHECKING:
 
 
 MOST_REWARDS = 100_000
-"""Rewards of so many transitions are remembered."""
+"""Largest number of transitions whose rewards are cached."""
 
 
 class LearnedEnv(gym.Env[Any, Any]):
-    """The world as an agent's model knows it now, with a reward of your choice.
+    """The current state of an agent's model as an environment, with a reward of your choice.
 
-    Next states and terminations are drawn from the model. Episodes start where the agent's did, as often. The spaces are those of
-    the agent's environment. No step of the real environment is taken, so rewards can be tried out, and algorithms
-    compared, in it; what they find is as good as the model.
+    Next states and terminations are sampled from the model. Start states are sampled with the frequencies of the agent's
+    episodes. The spaces are those of the agent's environment. No step of the real environment is taken, so rewards can be tested
+    and algorithms compared in it; the results depend on the accuracy of the model.
 
     Args:
-        agent: one that has learned. It may go on to learn: make another LearnedEnv then.
-        reward_fn: the reward, see RewardFn; None for what the agent plans for now (the environment's own, what it learned from
-            the rewards met, or what ``set_reward`` gave).
-        max_episode_steps: episodes are truncated after so many steps; None for never. Give the real environment's limit, as
-            the model does not know it.
+        agent: an agent that has learned. If it learns further, create a new LearnedEnv.
+        reward_fn: the reward, see RewardFn; None for the agent's current goal (the environment's own reward, one learned from
+            the observed rewards, or the function given to ``set_reward``).
+        max_episode_steps: number of steps after which episodes are truncated; None for no limit. Give the real environment's
+            limit, as it is not part of the model.
 
     Raises:
-        ValueError: the agent has learned nothing yet, or there is no reward; or a limit below 1.
-        TypeError: the agent is none; or the reward is no function of (obs, action, next_obs).
+        ValueError: the agent has learned nothing yet, there is no reward, or the limit is below 1.
+        TypeError: ``agent`` is not an agent, or the reward is not a function of (obs, action, next_obs).
 
     Example:
         agent = mbagent.ModelLearningAgent("MctsPolicy", env, seed=0).learn(20_000)
-        imagined = mbagent.LearnedEnv(agent, lambda obs, action, next_obs: next_obs[:, 9], max_episode_steps=100)
-        PPO("MlpPolicy", imagined).learn(100_000)
+        learned_env = mbagent.LearnedEnv(agent, lambda obs, action, next_obs: next_obs[:, 9], max_episode_steps=100)
+        PPO("MlpPolicy", learned_env).learn(100_000)
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own form
@@ -55,12 +55,14 @@ class LearnedEnv(gym.Env[Any, Any]):
         if not isinstance(getattr(agent, "policy", None), PlannerPolicy):
             raise TypeError(f"LearnedEnv needs an agent, a ModelLearningAgent that has learned, got {agent!r}.")
         with agent.policy.lock:
-            self._take(agent, reward_fn, max_episode_steps)
+            self._set_up(agent, reward_fn, max_episode_steps)
 
-    def _take(self, agent: ModelLearningAgent, reward_fn: RewardFn | None, max_episode_steps: int | None) -> None:
+    def _set_up(self, agent: ModelLearningAgent, reward_fn: RewardFn | None, max_episode_steps: int | None) -> None:
         policy = agent.policy
         if not policy.fitted:
-            raise ValueError("This agent has learned nothing yet, so there is no world to have back; call learn() first.")
+            raise ValueError(
+                "This agent has learned nothing yet, so there is no model to use as an environment; call learn() first."
+            )
         max_episode_steps = check_count("max_episode_steps", max_episode_steps, "no limit")
         if reward_fn is None and policy.goal is None:
             raise ValueError(NO_GOAL)
@@ -77,14 +79,14 @@ class LearnedEnv(gym.Env[Any, Any]):
         """See gymnasium.Env.
 
         Raises:
-            ValueError: options are given; there are none.
+            ValueError: options are given; none are supported.
         """
         super().reset(seed=seed)
         if options:
             raise ValueError(f"LearnedEnv takes no reset options, got {sorted(options)[0]!r}.")
         row = int(self.np_random.choice(len(self._starts), p=self._shares))
         self._state, self._steps = self._starts[row : row + 1], 0
-        return self._shown(self._state), {}
+        return self._observation(self._state), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """See gymnasium.Env.
@@ -99,14 +101,14 @@ class LearnedEnv(gym.Env[Any, Any]):
         if len(actions) != 1:
             raise ValueError(f"LearnedEnv.step takes one action, got a batch of {len(actions)}.")
         following, over = self.model.sample(self._state, actions, self.np_random.integers(2**64, size=1, dtype=np.uint64))
-        reward = self._earned(self._state, actions, following)
+        reward = self._reward_of(self._state, actions, following)
         self._state, self._steps = following, self._steps + 1
         terminated = bool(over[0])
         truncated = not terminated and self.max_episode_steps is not None and self._steps >= self.max_episode_steps
-        return self._shown(following), reward, terminated, truncated, {}
+        return self._observation(following), reward, terminated, truncated, {}
 
-    def _earned(self, states: States, actions: Actions, following: States) -> float:
-        """The reward of a transition; it is asked for once, as learned rewards and users' functions are quick in batches only."""
+    def _reward_of(self, states: States, actions: Actions, following: States) -> float:
+        """The reward of a transition; cached, since learned rewards and users' functions are fast only on batches."""
         key = states.tobytes() + actions.tobytes() + following.tobytes()
         if (known := self._rewards.get(key)) is not None:
             return known
@@ -116,12 +118,12 @@ class LearnedEnv(gym.Env[Any, Any]):
         reward = self._rewards[key] = float(self._reward(states, actions, following)[0])
         return reward
 
-    def _shown(self, state: States) -> Any:
+    def _observation(self, state: States) -> Any:
         return _first(self._space.decode(state))
 
 
 def _starts(agent: ModelLearningAgent) -> tuple[States, NDArray[np.float64]]:
-    """Start states [S, F], and the share of episodes that began in each; equal shares where the episodes are not at hand."""
+    """Start states [S, F], and the share of episodes that began in each; equal shares if no transitions are available."""
     rows = agent.transitions.rows()
     _, first = np.unique(rows.episodes, return_index=True)
     begun = rows.before[first].astype(np.int64)
@@ -131,7 +133,7 @@ def _starts(agent: ModelLearningAgent) -> tuple[States, NDArray[np.float64]]:
 
 
 def _first(batch: Any) -> Any:
-    """The observation of a batch of one, laid out as ``batch_space`` does."""
+    """The observation of a batch of one in the form of ``batch_space``."""
     if isinstance(batch, dict):
         return {key: _first(part) for key, part in batch.items()}
     if isinstance(batch, tuple):

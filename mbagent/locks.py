@@ -1,4 +1,4 @@
-"""Locks that may be part of objects that are copied or pickled, which those of the standard library may not."""
+"""Locks that can be members of copied or pickled objects, unlike those of the standard library."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Self
 
 
 class Lock:
-    """A re-entrant lock; a copied or unpickled one is new and free."""
+    """A re-entrant lock; a copied or unpickled one is new and unlocked."""
 
     def __init__(self) -> None:
         """See the class."""
@@ -25,15 +25,15 @@ class Lock:
         self._lock.release()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Neither the holder nor those who wait belong to a copy."""
+        """A copy is a new lock, without holder or waiting threads."""
         return type(self), ()
 
 
 class PlanningLock(Lock):
-    """The lock of everything that a plan depends on: while one thread plans, no other plans or changes anything.
+    """The lock of all data that a plan depends on: while one thread plans, no other thread plans or changes these data.
 
-    Neither may the thread itself, which the lock would let in: the reward function that the planner calls could otherwise
-    replace the search that it is called from.
+    The planning thread itself, which a re-entrant lock would admit, is excluded as well: a reward function called by the planner
+    could otherwise replace the search that calls it.
 
     Raises (when entered):
         RuntimeError: this thread is planning.
@@ -47,7 +47,7 @@ class PlanningLock(Lock):
     def __enter__(self) -> Self:
         """Waits until no other thread holds the lock."""
         super().__enter__()
-        if self._planning:  # only the thread that plans gets here
+        if self._planning:  # only the planning thread can get here
             super().__exit__()
             raise RuntimeError(
                 "A reward function must not use the agent that is planning with it (predict, explain, set_reward, learn ...); "
@@ -57,7 +57,7 @@ class PlanningLock(Lock):
 
     @contextmanager
     def planning(self) -> Iterator[None]:
-        """Holds the lock for a plan."""
+        """Holds the lock during a plan."""
         with self:
             self._planning = True
             try:

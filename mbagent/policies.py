@@ -1,4 +1,4 @@
-"""Planner policies: from an observation, by planning on the model, to an action."""
+"""Planner policies: SB3 policies that choose actions by planning with the model."""
 
 from __future__ import annotations
 
@@ -23,35 +23,35 @@ from mbagent.types import Reward, States
 from mbagent_envs.random_keys import derive
 
 NO_GOAL = (
-    "This agent was saved with a custom reward function, and files hold no code: give it again with "
+    "This agent was saved with a custom reward function, and files contain no code: give it again with "
     "load(path, reward=fn) or agent.set_reward(fn)."
 )
 
 
 class PlannerPolicy(BasePolicy):
-    """An SB3 policy whose forward pass is a plan.
+    """An SB3 policy that chooses actions by planning.
 
     Its parameters are those of the transition model and of the learned reward; ``state_dict`` and ``load_state_dict``
-    reach both, and loading drops every planning cache.
+    include both, and loading clears all planning caches.
 
-    Any number of threads may call its methods: each call waits for the one before it (see PlanningLock), so that the outcomes are
-    those of a single thread. Hold ``lock`` where several calls must not be parted.
+    Several threads may call its methods: each call waits for the previous one (see PlanningLock), so that the results are
+    those of a single thread. Hold ``lock`` around several calls that must not be interleaved with others.
 
     Args:
         observation_space: a discrete space (see FactoredSpace).
         action_space: a discrete space (see ActionEnumeration).
-        lr_schedule: unused here; SB3 passes it.
+        lr_schedule: unused; SB3 passes it.
         model: the transition model.
         reward_model: the learned reward.
         settings: see PlannerSettings.
-        factored: the observation space as factors, which the models are of; None for it as declared.
+        factored: the factors of the models; None for those of the observation space as declared.
 
     Attributes:
-        lock: held by whatever plans, or reads or changes what plans depend on.
+        lock: held while planning, and while reading or changing data that plans depend on.
 
     Raises:
-        ValueError: forecasts="direct" with another planner, or with a model that has none; a time budget or the reuse of trees
-            with a planner that has no use for it.
+        ValueError: forecasts="direct" with a planner or a model that does not support it; a time budget or the reuse of trees
+            with a planner that does not support it.
     """
 
     planner_class: ClassVar[type[Planner]] = MctsPlanner
@@ -76,10 +76,12 @@ class PlannerPolicy(BasePolicy):
         self.transition_model, self.reward_model, self.settings = model, reward_model, settings
         if settings.forecasts == "direct":
             if self.planner_class is not FlatMonteCarlo:
-                raise ValueError("forecasts='direct' is for the FlatMonteCarloPolicy; other planners go step by step.")
+                raise ValueError("forecasts='direct' is for the FlatMonteCarloPolicy; other planners plan step by step.")
             direct_model(model)
         if settings.time_budget is not None and self.planner_class is ValueIterationPlanner:
-            raise ValueError("time_budget is for policies that simulate; the ValueIterationPolicy goes by lookahead_states.")
+            raise ValueError(
+                "time_budget is for policies that simulate; the ValueIterationPolicy is limited by lookahead_states."
+            )
         if settings.reuse_tree and not issubclass(self.planner_class, MctsPlanner):
             raise ValueError("reuse_tree is for the MctsPolicy; other planners keep no tree.")
         self.planner: Planner = self.planner_class(settings)
@@ -90,26 +92,26 @@ class PlannerPolicy(BasePolicy):
         self._random = np.random.default_rng(int(derive(settings.seed, 0xAC71)[0]))
 
     def refresh(self, goal: Reward | None = None) -> None:
-        """Drops every cache after new weights or start states; takes a new goal if one is given."""
+        """Clears all caches after a change of weights or start states; sets a new goal if one is given."""
         with self.lock:
             self.planner.set_model(self.transition_model, self.start_states)
             self.set_goal(goal if goal is not None else self.goal)
 
     def parts(self) -> tuple[FactoredSpace, TransitionModel, LearnedReward, States, bool]:
-        """What is known, and in which factors; see ``recode``."""
+        """The arguments of ``recode`` that restore the present factors and models."""
         return self.factored, self.transition_model, self.reward_model, self.start_states, self.fitted
 
     def recode(
         self, factored: FactoredSpace, model: TransitionModel, reward_model: LearnedReward, start_states: States, fitted: bool
     ) -> None:
-        """Takes over what is known in other factors; no goal is left."""
+        """Replaces factors, models and start states; the goal is removed."""
         with self.lock:
             self.factored, self.transition_model, self.reward_model = factored, model, reward_model
             self.start_states, self.fitted, self.goal = start_states, fitted, None
             self.refresh()
 
     def set_goal(self, goal: Reward | None) -> None:
-        """Takes a goal (None: none is known, so ``predict`` refuses)."""
+        """Sets the goal; with None, ``predict`` raises ValueError."""
         with self.lock:
             self.goal = goal
             if goal is not None:
@@ -134,19 +136,19 @@ class PlannerPolicy(BasePolicy):
         episode_start: NDArray[Any] | None = None,
         deterministic: bool = False,
     ) -> tuple[Any, tuple[NDArray[Any], ...] | None]:
-        """The planner's best action for one observation or a batch; any number of threads may ask at once.
+        """The planner's best action for one observation or a batch; may be called by several threads.
 
         Args:
             observation: one observation of the space, or a batch of them.
-            state: passed through (the policy has no memory).
-            episode_start: bool [B]; ignored, as there is no memory, but for dropping the tree that ``reuse_tree`` keeps.
-            deterministic: makes no difference: both mean the best action found.
+            state: returned unchanged (the policy has no memory).
+            episode_start: bool [B]; used only to clear the search tree kept by ``reuse_tree``.
+            deterministic: ignored: the best action is returned in both cases.
 
         Returns:
             (action or batch of actions in the action space's own form, ``state``).
 
         Raises:
-            ValueError: an observation outside the space, or no goal known (see ``NO_GOAL``).
+            ValueError: an observation outside the space, or no known goal (see ``NO_GOAL``).
             RuntimeError: the reward function raised an error, the cause of this one.
         """
         batch, single = as_batch(self.observation_space, observation)
@@ -180,17 +182,17 @@ class PlannerPolicy(BasePolicy):
         return {name: torch.from_numpy(np.array(value)) for name, value in self.arrays().items()}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """As ``state_dict``, as numpy arrays."""
+        """The contents of ``state_dict`` as numpy arrays."""
         with self.lock:
             parts = {"model": self.transition_model.state_dict(), "reward": self.reward_model.state_dict()}
             arrays = {f"{part}.{name}": value for part, state in parts.items() for name, value in state.items()}
             return arrays | self.factored.value_arrays()
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> None:
-        """Takes weights over and drops every cache.
+        """Loads weights and clears all caches.
 
         Raises:
-            ValueError: the weights do not fit; nothing is changed then.
+            ValueError: the weights do not fit; the policy is unchanged.
         """
         del assign
         with self.lock:
@@ -201,14 +203,14 @@ class PlannerPolicy(BasePolicy):
             arrays = {**self.arrays(), **arrays}
         own = self.factored.value_arrays()
         if any(name in own and not np.array_equal(value, own[name]) for name, value in arrays.items()):
-            raise ValueError("These weights are of an agent that met other values; use agent.set_parameters.")
+            raise ValueError("These weights are of an agent that observed other values; use agent.set_parameters.")
         arrays = {name: value for name, value in arrays.items() if name not in own}
         unknown = [name for name in arrays if name.partition(".")[0] not in ("model", "reward")]
         if unknown:
             raise ValueError(f"There is no parameter called {unknown[0]!r}; take names from get_parameters()['policy'].")
         for name, value in arrays.items():
             if value.dtype.kind == "f" and not np.isfinite(value).all():
-                raise ValueError(f"The parameter {name!r} holds NaN or infinity; take weights from a sound agent.")
+                raise ValueError(f"The parameter {name!r} holds NaN or infinity; take weights from an intact agent.")
         before, reward = self.transition_model.state_dict(), _part(arrays, "reward.")
         self.transition_model.load_state_dict(_part(arrays, "model."))
         try:
@@ -224,12 +226,12 @@ class PlannerPolicy(BasePolicy):
         self.refresh()
 
     def save(self, path: Any) -> None:
-        """Refused: a policy without its agent's settings cannot be loaded again."""
+        """Not supported: a policy without its agent's settings could not be loaded again."""
         raise NotImplementedError("A planner policy is saved with its agent: agent.save(path), ModelLearningAgent.load(path).")
 
     @classmethod
     def load(cls, path: Any, device: Any = "auto") -> Any:
-        """Refused, see ``save``."""
+        """Not supported, see ``save``."""
         raise NotImplementedError("A planner policy is loaded with its agent: ModelLearningAgent.load(path).policy.")
 
 
@@ -246,7 +248,7 @@ class FlatMonteCarloPolicy(PlannerPolicy):
 
 
 class ValueIterationPolicy(PlannerPolicy):
-    """Greedy on the values of the finite-state machine generated from the model (section 2)."""
+    """Greedy with respect to the optimal values of the MDP generated from the model (section 2)."""
 
     planner_class = ValueIterationPlanner
 

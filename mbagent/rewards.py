@@ -1,6 +1,6 @@
 """Rewards that an agent plans for: the user's function, the environment's own, or one learned from observed rewards.
 
-A reward never steers exploration and never changes a transition model; only the planner receives it.
+Rewards influence neither exploration nor transition models; only the planner uses them.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from mbagent.types import Actions, Floats, Reward, States
 
 
 class RewardFn(Protocol):
-    """A goal, as users write it."""
+    """A reward function as written by users."""
 
     def __call__(self, obs: Any, action: Any, next_obs: Any, /) -> NDArray[Any]:
         """Rewards float [B] of a batch of transitions.
 
         Args:
-            obs: observations as ``gymnasium.vector.utils.batch_space`` lays them out, integers as int64.
+            obs: observations in the form of ``gymnasium.vector.utils.batch_space``, integers as int64.
             action: actions in the action space's own form, batched, integers as int64.
             next_obs: as ``obs``.
         """
@@ -50,11 +50,11 @@ def _check_signature(fn: Any) -> None:
 
 
 LARGEST_REWARD = 1e100
-"""Largest absolute reward: what is planned with adds, multiplies and squares them."""
+"""Largest absolute reward; planning adds, multiplies and squares rewards."""
 
 
 class CallableReward:
-    """A user's or an environment's reward function, as a goal on factors.
+    """A user's or an environment's reward function as a function of factors.
 
     Args:
         fn: the function.
@@ -63,7 +63,7 @@ class CallableReward:
 
     Raises (when called):
         TypeError: ``fn`` does not take three arguments, or does not return numbers.
-        ValueError: it returned a wrong shape, NaN or infinity.
+        ValueError: it returned a wrong shape, NaN, infinity or too large a number.
         RuntimeError: it raised an error, which is the cause (``__cause__``) of this one.
     """
 
@@ -89,7 +89,7 @@ class CallableReward:
             name = getattr(self.fn, "__qualname__", repr(self.fn))
             raise RuntimeError(
                 f"The reward function {name} raised {type(error).__name__} ({error}) when it was given {len(actions)} "
-                "transitions, met or imagined; mend it or give another goal with set_reward(fn)."
+                "transitions, observed or simulated; fix it or give another goal with set_reward(fn)."
             ) from error
         if result is None:
             raise TypeError("The reward function returned None; it must return an array of numbers: is a return missing?")
@@ -111,19 +111,19 @@ class CallableReward:
             raise ValueError("The reward function returned NaN or infinity; every reward must be a finite number.")
         if np.abs(rewards).max() > LARGEST_REWARD:
             raise ValueError(
-                f"The reward function returned {rewards[np.abs(rewards).argmax()]:g}; returns are sums of many rewards: none "
-                f"may be larger than {LARGEST_REWARD:g}: scale them down."
+                f"The reward function returned {rewards[np.abs(rewards).argmax()]:g}; since returns are sums of many rewards, "
+                f"none may be larger than {LARGEST_REWARD:g}: scale them down."
             )
         return rewards
 
 
 Source = Literal["custom", "environment", "learned", "missing"]
 
-_PROBE_ROWS = 64
+_TEST_ROWS = 64
 
 
 def reward_wrapper(env: VecEnv) -> str | None:
-    """Name of a wrapper of the first environment that changes rewards, or None (also where another process hides it)."""
+    """Name of a wrapper of the first environment that changes rewards; None if there is none, or in a subprocess."""
     inner = getattr(env.unwrapped, "envs", [None])[0]
     while isinstance(inner, gym.Wrapper):
         if isinstance(inner, gym.RewardWrapper | gym.wrappers.NormalizeReward):
@@ -133,20 +133,20 @@ def reward_wrapper(env: VecEnv) -> str | None:
 
 
 class RewardSelector:
-    """Keeps the candidates for the goal and decides between them.
+    """Selects the goal from the custom, the environment's and the learned reward.
 
-    With no custom reward the environment's own ``reward_fn`` is used if it has one and it reproduces every reward met
-    while exploring (wrappers can change spaces and rewards); else the learned reward, with a warning that says why.
+    Without a custom reward, the environment's own ``reward_fn`` is used if there is one and it reproduces all observed
+    rewards (wrappers can change spaces and rewards); else the learned reward, with a warning that gives the reason.
 
     Args:
-        policy: knows spaces and the learned reward.
-        experience: what was met.
+        policy: the policy, with its spaces and the learned reward.
+        experience: the observed transitions.
 
     Attributes:
-        source: where the current goal comes from; "missing" after loading an agent whose custom reward was not given
+        source: source of the current goal; "missing" after loading an agent whose custom reward was not given
             again.
         learned: whether the reward model is fitted to all transitions.
-        reward_report: how well it tells rewards; None before it is fitted.
+        reward_report: accuracy of the learned reward; None before it is fitted.
     """
 
     def __init__(self, policy: PlannerPolicy, experience: Experience) -> None:
@@ -157,53 +157,53 @@ class RewardSelector:
         self._since = 0
         self._unusable = "There is no environment"
         self._changes_rewards: str | None = None
-        self._told: str | None = None
+        self._last_warning: str | None = None
         self.source: Source = "environment"
         self.learned = False
         self.reward_report: RewardReport | None = None
 
     def take_environment(self, env: VecEnv) -> None:
-        """Takes the ``reward_fn`` of a new environment, if it has one."""
+        """Uses the ``reward_fn`` of a new environment, if it has one."""
         self._since, self._environment = len(self._experience.dataset), None
         fn, self._unusable = own_reward(env)
         if fn is not None:
             try:
-                self._environment = self._given(fn)
-            except TypeError as error:  # something else that happens to have that name
+                self._environment = self._as_goal(fn)
+            except TypeError as error:  # an attribute of that name that is not a reward function
                 self._unusable = f"The environment's reward_fn cannot be used as a goal ({str(error).rstrip('.')})"
-        self._changes_rewards, self._told = reward_wrapper(env), None
+        self._changes_rewards, self._last_warning = reward_wrapper(env), None
 
     @property
     def _transitions(self) -> TransitionDataset:
         return self._experience.coded(self._policy.factored)
 
     def recode(self) -> None:
-        """The policy's factors have changed."""
+        """Updates the rewards after a change of the policy's factors."""
         self._custom, self._environment = (
-            None if given is None else self._given(given.fn) for given in (self._custom, self._environment)
+            None if given is None else self._as_goal(given.fn) for given in (self._custom, self._environment)
         )
         self.learned = False
 
     def forget_learned(self) -> None:
-        """The learned reward is out of date: there are new transitions."""
+        """Marks the learned reward as outdated, since there are new transitions."""
         self.learned = False
 
     def choose(self, reward: RewardFn | None) -> Reward | None:
-        """Changes the goal; ``None`` goes back to the environment's own.
+        """Changes the goal; ``None`` returns to the environment's own.
 
         Raises:
-            TypeError, ValueError, RuntimeError: the function is no reward function, or fails; nothing is changed then.
+            TypeError, ValueError, RuntimeError: the function is not a reward function, or fails; the goal is unchanged.
         """
         custom = None
         if reward is not None:
-            custom = self._given(reward)
-            self._probe(custom)
+            custom = self._as_goal(reward)
+            self._test(custom)
         self._custom = custom
         self.source = "custom" if custom is not None else "environment"
         return self.current()
 
     def current(self) -> Reward | None:
-        """The goal to plan for; None while nothing is learned and no reward is given."""
+        """The current goal; None while nothing is learned and no reward is given."""
         if self.source == "missing":
             return None
         if self._custom is not None:
@@ -212,25 +212,25 @@ class RewardSelector:
         if problem is None:
             self.source = "environment"
             if self._changes_rewards and self._policy.fitted and len(self._experience.dataset) == self._since:
-                self._tell(
-                    f"{self._changes_rewards} changes the environment's rewards, which the agent has not met yet: until the next "
-                    "learn() it plans with the reward_fn inside; to be sure, give the goal with set_reward(fn)."
+                self._warn(
+                    f"{self._changes_rewards} changes the environment's rewards, which the agent has not observed yet: until "
+                    "the next learn() it plans with the reward_fn inside; to be sure, give the goal with set_reward(fn)."
                 )
             return self._environment
         self.source = "learned"
         if not self._policy.fitted:
             return None
-        self._tell(f"{problem}, so the agent plans with a reward learned from the rewards it met.")
+        self._warn(f"{problem}, so the agent plans with a reward learned from the rewards it observed.")
         return self.learned_goal()
 
-    def _tell(self, message: str) -> None:
-        """Warns, unless the last warning said the same."""
-        if message != self._told:
+    def _warn(self, message: str) -> None:
+        """Warns, unless the last warning was the same."""
+        if message != self._last_warning:
             warnings.warn(message, stacklevel=6)
-            self._told = message
+            self._last_warning = message
 
     def restore(self, source: Source) -> Reward | None:
-        """The goal of an agent loaded from a file, where only its source is kept; None if it must be given again."""
+        """The goal of an agent loaded from a file, which contains only its source; None if it must be given again."""
         if source == "custom":
             self.source = "missing"
             return None
@@ -238,12 +238,12 @@ class RewardSelector:
         return self.learned_goal() if source == "learned" else self.current()
 
     def learned_goal(self) -> Reward:
-        """The reward model, fitted first if need be."""
+        """The reward model, which is fitted if necessary."""
         self.fit_learned()
         return self._policy.reward_model
 
     def fit_learned(self) -> None:
-        """Fits the reward model to the rewards met, unless that is done."""
+        """Fits the reward model to the observed rewards, unless it is up to date."""
         rows = self._transitions.rows()
         if not self.learned and len(rows):
             recent = np.arange(self._since if self._since < len(rows) else 0, len(rows))
@@ -267,20 +267,20 @@ class RewardSelector:
         if wrong.any():
             until = wrong_until(rows, wrong)
             if until is not None:
-                self._tell(
+                self._warn(
                     f"The environment's rewards changed after about {until:,} steps, and its reward_fn gives those observed "
                     "since then, so the agent plans with it; when you change rewards, give the new goal with set_reward(fn), or "
-                    "call set_env(env), which starts the rewards afresh."
+                    "call set_env(env), after which earlier rewards are ignored."
                 )
                 return None
-            return f"The environment's reward_fn differs from {int(wrong.sum())} of the {len(rows)} rewards met"
+            return f"The environment's reward_fn differs from {int(wrong.sum())} of the {len(rows)} rewards observed"
         return None
 
-    def _probe(self, reward: CallableReward) -> None:
-        """Tries a reward function on transitions met, or on the space's first observation."""
+    def _test(self, reward: CallableReward) -> None:
+        """Tests a reward function on observed transitions, or else on start states or the space's first observation."""
         rows = self._transitions.rows()
         if len(rows):
-            picked = rows.select(np.linspace(0, len(rows) - 1, min(_PROBE_ROWS, len(rows))).astype(np.int64))
+            picked = rows.select(np.linspace(0, len(rows) - 1, min(_TEST_ROWS, len(rows))).astype(np.int64))
             reward(picked.states, picked.actions, picked.next_states)
             return
         states = np.zeros((3, len(self._policy.factored)), dtype=np.int64)
@@ -288,5 +288,5 @@ class RewardSelector:
             states = self._policy.start_states[np.arange(3) % len(self._policy.start_states)]
         reward(states, np.zeros(3, dtype=np.int64), states)
 
-    def _given(self, fn: RewardFn) -> CallableReward:
+    def _as_goal(self, fn: RewardFn) -> CallableReward:
         return CallableReward(fn, self._policy.factored, self._policy.actions)

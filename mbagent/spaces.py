@@ -1,7 +1,7 @@
-"""Any discrete Gymnasium space as an array of categorical factors (paper section 2.1, "factored representations").
+"""Encoding of any discrete Gymnasium space as an array of categorical factors (paper 2.1, "factored representations").
 
 A space is flattened into its *elementary* spaces (those inside nested ``Dict`` and ``Tuple`` spaces), and each of these into
-*factors*: a binary variable of the paper is a factor with two values, a ``Discrete(n)`` is one factor with ``n``.
+*factors*: a binary variable of the paper is a factor with two values, a ``Discrete(n)`` is one factor with ``n`` values.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 MAX_CARDINALITY = 4096
-"""More values than this in one factor are refused: no model here could learn them from data."""
+"""Largest number of values of one factor; with more, no model here could be learned from data."""
 
 MAX_DECLARED = 64
-"""A Box that declares more values than this for a variable says how they are stored, not which there are."""
+"""If a Box declares more values than this for a variable, its bounds are assumed to reflect a data type, not the real values."""
 
 _WIDEST = 2**62
-"""Values are numbered up to here."""
+"""Largest supported number of declared values."""
 
 Path = tuple[str | int, ...]
 
@@ -31,11 +31,11 @@ class OutsideSpaceError(ValueError):
     """A value that is not one of its space.
 
     Args:
-        cause: what is wrong, as the beginning of a sentence.
-        remedy: what a caller who passed the value should do, as its end.
+        cause: the problem, as the beginning of a sentence.
+        remedy: advice to the caller who passed the value, as the end of the sentence.
 
     Attributes:
-        cause: as given; whoever knows that the value is not the caller's names another remedy.
+        cause: as given, for messages with another remedy if the value is not the caller's.
     """
 
     def __init__(self, cause: str, remedy: str) -> None:
@@ -46,15 +46,15 @@ class OutsideSpaceError(ValueError):
 
 @dataclass(frozen=True)
 class Leaf:
-    """One elementary space: its path in the nested space and how its values become numbers.
+    """One elementary space, with its path in the nested space and the numbering of its values.
 
     Attributes:
-        path: keys and indices that lead to it.
+        path: keys and indices of the space within the nested space.
         space: the space itself.
         low: each variable's lowest value, int64 [n].
-        cardinalities: how many values each variable has, length n.
-        shape: of one value of the space.
-        open: whether only the values that are met count, as there are too many that could be.
+        cardinalities: number of values of each variable, length n.
+        shape: shape of one value of the space.
+        open: whether only observed values are numbered, because too many are declared.
     """
 
     path: Path
@@ -66,12 +66,12 @@ class Leaf:
 
     @property
     def name(self) -> str:
-        """The path, as text."""
+        """The path as text."""
         return ".".join(str(part) for part in self.path)
 
     @property
     def where(self) -> str:
-        """The path, for error messages; empty where the space is not nested."""
+        """The path, for error messages; empty if the space is not nested."""
         return f" part {self.name!r}" if self.path else ""
 
     def encode(self, batch: Any, kind: str) -> NDArray[np.int64]:
@@ -98,7 +98,7 @@ class Leaf:
             holds = f"The {kind}{self.where} holds the value {flat[row, variable]}"
             if _WIDEST in self.cardinalities:
                 raise OutsideSpaceError(
-                    f"{holds}, but only whole numbers from -2^61 to 2^61 are told apart",
+                    f"{holds}, but only whole numbers from -2^61 to 2^61 are supported",
                     "make them smaller in a gymnasium.ObservationWrapper",
                 )
             low, at = int(self.low[variable]), np.unravel_index(variable, self.shape)
@@ -109,7 +109,7 @@ class Leaf:
         return numbers
 
     def decode(self, numbers: NDArray[np.int64], wide: bool) -> NDArray[Any]:
-        """Values [B, ...] of numbers int64 [B, n], which are changed; of the space's data type, or int64 if ``wide``."""
+        """Values [B, ...] of numbers int64 [B, n], which are modified; of the space's data type, or int64 if ``wide``."""
         if self.low.any():
             numbers += self.low
         dtype = np.dtype(np.int64) if wide else np.dtype(self.space.dtype)
@@ -120,7 +120,7 @@ def leaves(space: spaces.Space[Any], kind: str, path: Path = ()) -> Iterator[Lea
     """The elementary spaces inside ``space``, in its own order.
 
     Raises:
-        TypeError: one is not discrete; the message names it and the way out.
+        TypeError: one of them is not discrete; the message names it and a solution.
     """
     if isinstance(space, spaces.Dict):
         for key, part in space.spaces.items():
@@ -147,7 +147,7 @@ def _value_range(space: spaces.Space[Any], path: Path, kind: str) -> tuple[NDArr
     where = f" part {'.'.join(map(str, path))!r}" if path else ""
     if isinstance(space, spaces.Box) and kind == "observation":
         if space.dtype is not None and np.dtype(space.dtype).kind in "iub":
-            # Python's integers, and no more values than can be numbered: no overflow.
+            # Python integers and a limit on the number of values prevent overflow.
             lows = [max(int(low), -_WIDEST // 2) for low in space.low.ravel().tolist()]
             highs = [int(high) for high in space.high.ravel().tolist()]
             return np.array(lows, dtype=np.int64), [min(high - low + 1, _WIDEST) for low, high in zip(lows, highs, strict=True)]
@@ -185,7 +185,7 @@ def _descend(batch: Any, path: Path, kind: str) -> Any:
 
 
 def assemble(space: spaces.Space[Any], parts: Mapping[Path, NDArray[Any]], path: Path = ()) -> Any:
-    """Batched values of the elementary spaces, by path, laid out as ``batch_space`` does."""
+    """Combines batched values of the elementary spaces, by path, in the form of ``batch_space``."""
     if isinstance(space, spaces.Dict):
         return {key: assemble(part, parts, (*path, key)) for key, part in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
@@ -197,15 +197,15 @@ FactorValues = NDArray[np.int64]
 """Factor values, int [B, F]; factor f takes the values 0 ... cardinalities[f] - 1."""
 
 _TABLED = 1024
-"""Up to so many declared values of an open factor are looked up in a table."""
+"""Largest number of declared values for which the nearest observed values are tabulated."""
 
 MAX_ACTIONS = 4096
-"""More joint actions than this is refused: planning enumerates them."""
+"""Largest number of joint actions, since planning enumerates them."""
 
 
 @dataclass(frozen=True)
 class PlaneLayout:
-    """Where the cells of a stack of planes lie in a flat row of factors.
+    """Layout of the cells of a stack of planes in a flat vector of factors.
 
     Attributes:
         channels: number of planes C.
@@ -229,18 +229,18 @@ class PlaneLayout:
 
 
 class FactoredSpace:
-    """Translates between batches of a discrete space and arrays of factors; the two directions are exact inverses.
+    """Converts between batches of a discrete space and arrays of factors; the two directions are exact inverses.
 
-    A variable with very many declared values (a Box of more than 64, as images declare 256; else more than 4,096) is
-    *open*: only the values that are met count. Without ``values`` it is numbered as declared, which no model should be
-    given; ``with_values`` gives the space whose open factors are the values met, in order. A value that is not among them
-    is then taken for the nearest that is.
+    A variable with many declared values (in a Box more than 64, for example 256 in images; else more than 4,096) is
+    *open*: only observed values are numbered. Without ``values`` it has the declared numbers, which are not suitable for
+    models; ``with_values`` returns the space whose open factors have the observed values, in order. Any other value is
+    then replaced by the nearest observed one.
 
     Args:
-        space: Discrete, MultiDiscrete, MultiBinary, integer or boolean Box, or a Dict or Tuple of these, nested at
-            will.
+        space: Discrete, MultiDiscrete, MultiBinary, integer or boolean Box, or a Dict or Tuple of these, nested to any
+            depth.
         kind: word for error messages, "observation" or "action".
-        values: numbers of the values met by each open factor, ascending; None for all that are declared.
+        values: declared numbers of the observed values of each open factor, ascending; None for all declared values.
 
     Attributes:
         space: the space itself.
@@ -248,11 +248,11 @@ class FactoredSpace:
         names: a readable name for each factor, length F.
         open: the open factors, int64 [O].
         values: as given.
-        planes: the layout when the space is one stack of two-dimensional planes, else None.
+        planes: the layout if the space is one stack of two-dimensional planes, else None.
 
     Raises:
-        TypeError: the space holds a continuous or unsupported part; the message names it and the way out.
-        ValueError: there is no variable, or one has met more than ``MAX_CARDINALITY`` values.
+        TypeError: the space contains a continuous or unsupported part; the message names it and a solution.
+        ValueError: there is no variable, or one has more than ``MAX_CARDINALITY`` observed values.
     """
 
     def __init__(
@@ -275,13 +275,13 @@ class FactoredSpace:
         self.cardinalities: tuple[int, ...] = tuple(cardinalities)
 
     def _count_only(self, values: tuple[NDArray[np.int64], ...], cardinalities: list[int]) -> None:
-        """Gives open factors the values met; where few are declared, with a table of the nearest to look up."""
+        """Restricts open factors to the observed values; tabulates the nearest ones if few values are declared."""
         declared = max(cardinalities[factor] for factor in self.open)
         for factor, known in zip(self.open, values, strict=True):
             if len(known) > MAX_CARDINALITY:
                 raise ValueError(
                     f"The {self.kind}'s variable {self.names[factor]!r} took {len(known)} values, more than {MAX_CARDINALITY}; "
-                    "make them fewer in a gymnasium.ObservationWrapper, or see them as bits with mbagent.wrappers.Bits."
+                    "reduce them in a gymnasium.ObservationWrapper, or convert them to bits with mbagent.wrappers.Bits."
                 )
             cardinalities[factor] = len(known)
         most = max(map(len, values))
@@ -298,23 +298,23 @@ class FactoredSpace:
         """Factors of a batch.
 
         Args:
-            batch: laid out as ``gymnasium.vector.utils.batch_space`` does: arrays [B, ...], in Dicts and Tuples by
-                leaf.
+            batch: in the form of ``gymnasium.vector.utils.batch_space``: arrays [B, ...], in Dicts and Tuples one per
+                elementary space.
 
         Returns:
             int64 [B, F].
 
         Raises:
-            ValueError: a value lies outside the space, or the shape does not fit; the message says which part.
+            ValueError: a value lies outside the space, or the shape does not fit; the message names the part.
         """
         return self.narrow(np.concatenate([leaf.encode(batch, self.kind) for leaf in self._leaves], axis=1))
 
     def decode(self, factors: NDArray[Any]) -> Any:
-        """The batch, laid out as ``batch_space`` does and in the space's own data types, that [B, F] factors stand for."""
+        """The batch of factors [B, F], in the form of ``batch_space`` and in the space's own data types."""
         return self._decode(factors, integers=False)
 
     def decode_wide(self, factors: NDArray[Any]) -> Any:
-        """As ``decode``, with every integer widened to int64 (what reward functions get: int8 sums overflow)."""
+        """As ``decode``, with all integers as int64 (for reward functions, since int8 sums overflow)."""
         return self._decode(factors, integers=True)
 
     def _decode(self, factors: NDArray[Any], integers: bool) -> Any:
@@ -322,28 +322,28 @@ class FactoredSpace:
         start, numbers = 0, self.widen(factors)
         for leaf in self._leaves:
             stop = start + len(leaf.cardinalities)
-            parts[leaf.path] = leaf.decode(numbers[:, start:stop].astype(np.int64), integers)  # a copy, which may be changed
+            parts[leaf.path] = leaf.decode(numbers[:, start:stop].astype(np.int64), integers)  # a copy, which may be modified
             start = stop
         return assemble(self.space, parts)
 
     def with_values(self, numbers: NDArray[Any]) -> FactoredSpace:
-        """The space whose open factors are the values met.
+        """The space in which open factors have the observed values.
 
         Args:
-            numbers: what was met, int [N, F], numbered as declared; the lowest values where N is 0.
+            numbers: observed states, int [N, F], in declared numbers; if N is 0, the lowest values are used.
 
         Raises:
-            ValueError: a variable took more than ``MAX_CARDINALITY`` values.
+            ValueError: a variable has more than ``MAX_CARDINALITY`` values.
         """
         if not len(self.open):
             return self
         rows = numbers if len(numbers) else np.zeros((1, len(self)), dtype=np.int64)
-        met = {int(factor): np.unique(rows[:, factor]) for factor in self.open}
-        if self.planes is not None and len(met) == len(self):  # a plane's cells have the same values, so that they can share
+        observed = {int(factor): np.unique(rows[:, factor]) for factor in self.open}
+        if self.planes is not None and len(observed) == len(self):  # all cells of a plane get the same values, for tied models
             for plane in self.planes.to_planes(np.arange(len(self))[None])[0]:
-                together = np.unique(np.concatenate([met[int(factor)] for factor in plane.ravel()]))
-                met |= dict.fromkeys(plane.ravel().tolist(), together)
-        return FactoredSpace(self.space, self.kind, [met[int(factor)] for factor in self.open])
+                together = np.unique(np.concatenate([observed[int(factor)] for factor in plane.ravel()]))
+                observed |= dict.fromkeys(plane.ravel().tolist(), together)
+        return FactoredSpace(self.space, self.kind, [observed[int(factor)] for factor in self.open])
 
     def same_factors(self, other: FactoredSpace) -> bool:
         """Whether the factors of both have the same values."""
@@ -351,16 +351,16 @@ class FactoredSpace:
         return own.keys() == others.keys() and all(np.array_equal(own[name], others[name]) for name in own)
 
     def value_arrays(self) -> dict[str, NDArray[np.int64]]:
-        """The open factors' values as arrays, "space.values" one after the other and how many each has; empty without any."""
+        """The open factors' values, concatenated in "space.values", with their numbers in "space.counts"; empty without any."""
         if self._nearest is None or self.values is None:
             return {}
         return {"space.values": np.concatenate(self.values), "space.counts": np.array([len(known) for known in self.values])}
 
     def from_value_arrays(self, arrays: Mapping[str, NDArray[Any]]) -> FactoredSpace:
-        """The space whose ``value_arrays`` these are; this one, where there are none among them.
+        """The space with these ``value_arrays``; this space if ``arrays`` does not contain them.
 
         Raises:
-            ValueError: they are of another space.
+            ValueError: the arrays belong to another space.
         """
         if "space.values" not in arrays or "space.counts" not in arrays:
             return self
@@ -370,7 +370,7 @@ class FactoredSpace:
         return FactoredSpace(self.space, self.kind, np.split(values, np.cumsum(counts)[:-1]))
 
     def narrow(self, numbers: NDArray[np.int64]) -> FactorValues:
-        """Factors int64 [B, F] of numbers as declared: the nearest of the values met, the lower of two."""
+        """Factors int64 [B, F] of declared numbers: the nearest observed value, the lower one in a tie."""
         if self._nearest is None:
             return numbers
         factors = numbers.copy()
@@ -382,7 +382,7 @@ class FactoredSpace:
         return factors
 
     def widen(self, factors: NDArray[Any]) -> NDArray[Any]:
-        """Numbers as declared, int [B, F], of factors."""
+        """Declared numbers, int [B, F], of factors."""
         if self._nearest is None:
             return factors
         numbers = factors.astype(np.int64)
@@ -391,14 +391,14 @@ class FactoredSpace:
 
 
 def _nearest(known: NDArray[np.int64], numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Which of ``known``, ascending, is nearest to each number; the lower of two."""
+    """Index of the nearest of ``known`` (ascending) to each number; the lower one in a tie."""
     above = np.minimum(np.searchsorted(known, numbers), len(known) - 1)
     below = np.maximum(above - 1, 0)
     return np.where(np.abs(numbers - known[below]) <= np.abs(known[above] - numbers), below, above)
 
 
 class ActionEnumeration:
-    """A discrete action space as one list of joint actions, numbered 0 ... n - 1.
+    """Numbering of the joint actions of a discrete action space, 0 ... n - 1.
 
     Args:
         space: a Discrete, MultiDiscrete or MultiBinary action space.
@@ -439,7 +439,7 @@ class ActionEnumeration:
         return self.factored.decode(self._factors(indices))
 
     def decode_wide(self, indices: NDArray[Any]) -> Any:
-        """As ``decode``, integers as int64 (for reward functions)."""
+        """As ``decode``, with all integers as int64 (for reward functions)."""
         return self.factored.decode_wide(self._factors(indices))
 
     def _factors(self, indices: NDArray[Any]) -> FactorValues:
@@ -451,8 +451,8 @@ class ActionEnumeration:
 def _plane_layout(space: spaces.Space[Any]) -> PlaneLayout | None:
     """The layout if ``space`` is one stack of planes: two or three dimensions, cells at least 3 by 3.
 
-    Of three dimensions, the channel axis is the one whose size differs where the other two (the first two or the last two)
-    are equal; else the first, unless the last is strictly the smaller.
+    With three dimensions, if exactly the first two or exactly the last two sizes are equal, the remaining axis is the channel
+    axis; otherwise it is the first axis, unless the last one is strictly smaller.
     """
     if not isinstance(space, spaces.MultiBinary | spaces.Box | spaces.MultiDiscrete):
         return None
@@ -473,7 +473,7 @@ def as_batch(space: spaces.Space[Any], value: Any, kind: str = "observation") ->
     """An observation (or action) as a batch, and whether it was a single one.
 
     Raises:
-        OutsideSpaceError: it is not made of numbers, or its shape is neither that of one value of ``space`` nor of a batch.
+        OutsideSpaceError: ``value`` is not numeric, or its shape is neither that of one value of ``space`` nor of a batch.
     """
     if kind == "observation":
         _refuse_returned(space, value)
@@ -510,7 +510,7 @@ def one_as_batch(space: spaces.Space[Any], value: Any, kind: str = "observation"
     """One observation (or action) as a batch of one.
 
     Raises:
-        OutsideSpaceError: it is none of ``space``, or a batch.
+        OutsideSpaceError: ``value`` is not one of ``space``, or is a batch.
     """
     batch, single = as_batch(space, value, kind)
     if not single:
@@ -519,7 +519,7 @@ def one_as_batch(space: spaces.Space[Any], value: Any, kind: str = "observation"
 
 
 def _all_single(parts: list[tuple[Any, bool]], kind: str) -> bool:
-    """Whether all parts are single values; OutsideSpaceError if they are not all alike, or batches of unequal length."""
+    """Whether all parts are single values; OutsideSpaceError if only some are, or if batches differ in length."""
     if len({single for _, single in parts}) > 1:
         raise OutsideSpaceError(
             f"Some parts of the {kind} are batches and some are not", f"give one {kind}, or a batch of all parts"
@@ -531,7 +531,7 @@ def _all_single(parts: list[tuple[Any, bool]], kind: str) -> bool:
 
 
 def _refuse_returned(space: spaces.Space[Any], value: Any) -> None:
-    """Raises OutsideSpaceError if what is given for an observation is all that ``reset`` or ``step`` returned."""
+    """Raises OutsideSpaceError if the observation is the whole tuple returned by ``reset`` or ``step``."""
     returned = isinstance(value, tuple) and len(value) in (2, 5) and isinstance(value[-1], dict)
     if returned and not (isinstance(space, spaces.Tuple) and isinstance(space.spaces[-1], spaces.Dict)):
         method = "reset" if len(value) == 2 else "step"

@@ -14,10 +14,10 @@ from mbagent.models.fit_report import FitReport
 
 
 def check_progress(show: bool) -> None:
-    """Whether a progress bar can be shown, if one is asked for.
+    """Checks that a progress bar can be shown, if requested.
 
     Raises:
-        ImportError: a package is missing; the message names the pip line.
+        ImportError: a package is missing; the message contains the pip command.
     """
     if not show:
         return
@@ -32,7 +32,7 @@ def check_progress(show: bool) -> None:
 
 @contextmanager
 def fit_progress(show: bool) -> Iterator[Callable[[float], None] | None]:
-    """A function to tell the share of a fit that is done, shown as a bar; None without ``show``, see ``check_progress``."""
+    """A function that displays the completed share of a fit as a bar; None without ``show``, see ``check_progress``."""
     if not show:
         yield None
         return
@@ -40,10 +40,10 @@ def fit_progress(show: bool) -> Iterator[Callable[[float], None] | None]:
 
     with tqdm(total=100, desc="fitting the model", unit="%") as bar:
 
-        def tell(share: float) -> None:
+        def update(share: float) -> None:
             bar.update(round(100 * share) - bar.n)
 
-        yield tell
+        yield update
         bar.update(100 - bar.n)
 
 
@@ -52,10 +52,10 @@ def log_fit(logger: Logger, report: FitReport, n_updates: int, n_transitions: in
 
     Args:
         logger: SB3's logger.
-        report: what the fit did.
+        report: report of the fit.
         n_updates: fits so far.
-        n_transitions: transitions met so far.
-        n_start_states: distinct start states known.
+        n_transitions: transitions observed so far.
+        n_start_states: number of distinct start states.
     """
     figures = {
         "predictor_loss": report.predictor_loss,
@@ -80,9 +80,9 @@ def log_rollout(agent: BaseAlgorithm, began: float, steps_before: int) -> None:
     """Writes the ``rollout/`` and ``time/`` figures to the agent's log.
 
     Args:
-        agent: whose buffers of episodes are read.
-        began: when ``learn`` began, nanoseconds since the epoch.
-        steps_before: environment steps before that.
+        agent: the agent, with its buffers of episodes.
+        began: start time of ``learn``, nanoseconds since the epoch.
+        steps_before: number of environment steps before that.
     """
     seconds, logger = max((time.time_ns() - began) / 1e9, 1e-9), agent.logger
     if agent.ep_info_buffer:

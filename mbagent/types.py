@@ -1,4 +1,4 @@
-"""Type aliases that the whole package shares. Shapes: B batch, F factors."""
+"""Type aliases shared by the whole package. Shapes: B batch, F factors."""
 
 from collections.abc import Callable
 from typing import TypeAlias
@@ -18,8 +18,8 @@ Actions: TypeAlias = NDArray[np.int64]
 Words: TypeAlias = NDArray[np.uint64]
 """Sets of small numbers, 64 to a word."""
 Randomness: TypeAlias = np.random.Generator | Keys
-"""A Generator, or keys uint64 [B], one a row, so that no row's draw depends on another row."""
+"""A Generator, or keys uint64 [B], one per row, so that no row's sample depends on another row."""
 Progress: TypeAlias = Callable[[float], None]
-"""Is given the share of the work that is done, 0 ... 1."""
+"""Called with the completed share of the work, 0 ... 1."""
 Reward: TypeAlias = Callable[[States, Actions, States], Floats]
 """``reward(states int64 [M, F], actions int64 [M], next_states int64 [M, F]) -> float64 [M]``, finite."""

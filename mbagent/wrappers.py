@@ -1,4 +1,4 @@
-"""Wrappers that make a world fit for a model of single steps."""
+"""Wrappers that adapt environments to models of single steps."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from mbagent.spaces import MAX_DECLARED, ActionEnumeration, FactoredSpace
 class History(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
     """Makes the last ``k`` observations and actions part of the observation.
 
-    For worlds whose next state depends on more than what an observation shows: a model of single steps can then see
-    what it needs. A stack of planes stays one, channels first: older observations and one plane for each action become
-    further channels (an action's plane is on everywhere, or off). Any other space, and planes of which so many channels could
-    be taken for rows (boards that are not square, with more channels than columns), become one row of variables: the
-    observation's, then, for each step back, the older observation's and one bit for each action. Before the first step
-    the older observations are the first one, and no action is on.
+    For environments whose next state depends on more than the current observation: a model of single steps then has the
+    information it needs. A stack of planes remains one, channels first: older observations and one plane for each action become
+    further channels (an action's plane is 1 everywhere, or 0). In any other space, and for planes whose channels would then be
+    mistaken for rows (boards that are not square, with more channels than columns), the observation becomes a vector of
+    variables: those of the observation, then, for each step back, those of the older observation and one bit for each action.
+    Before the first step the older observations are copies of the first one, and all action bits are 0.
 
     Args:
         env: an environment with discrete spaces (see FactoredSpace).
@@ -63,20 +63,20 @@ class History(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
         obs, info = self.env.reset(seed=seed, options=options)
         self._now = self._factors(obs)
         self._past.extend([(self._now, -1)] * self.k)
-        return self._shown(), info
+        return self._with_history(), info
 
     def step(self, action: Any) -> tuple[NDArray[np.int64], Any, bool, bool, dict[str, Any]]:
         """See gymnasium.Env."""
         obs, reward, terminated, truncated, info = self.env.step(action)
         self._past.appendleft((self._now, int(self._actions.encode(_batch(action))[0])))
         self._now = self._factors(obs)
-        return self._shown(), reward, terminated, truncated, info
+        return self._with_history(), reward, terminated, truncated, info
 
     def _factors(self, obs: Any) -> NDArray[np.int64]:
         factors: NDArray[np.int64] = self._space.encode(_batch(obs))[0]
         return factors
 
-    def _shown(self) -> NDArray[np.int64]:
+    def _with_history(self) -> NDArray[np.int64]:
         """The observation with its past, newest first."""
         planes = self._planes
         parts = []
@@ -90,10 +90,10 @@ class History(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
 
 
 class Flat(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArgs):
-    """Makes an observation of parts within parts one Dict of all elementary parts.
+    """Flattens a nested observation to one Dict of all elementary parts.
 
-    SB3's vector environments carry Dicts and Tuples, but none inside another. A part's key is the path to it with dots
-    between ("robot.arm", "sensors.0"); an observation that is not nested becomes a Dict of one part, "obs".
+    SB3's vector environments support Dicts and Tuples, but not nested ones. A part's key is the path to it, separated by
+    dots ("robot.arm", "sensors.0"); an observation that is not nested becomes a Dict of one part, "obs".
 
     Args:
         env: an environment with any observation space of Dicts and Tuples.
@@ -125,16 +125,16 @@ class Flat(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArg
 
 
 class Bits(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArgs):
-    """Makes an observation that is one large number its binary digits, the highest first.
+    """Replaces an observation that is one large number by its binary digits, the highest first.
 
-    For a ``Discrete`` of very many values whose digits mean something each, as where a simulator packs flags into one
-    number: a model can then learn each bit by itself. Where they mean nothing, leave the number as it is.
+    For a ``Discrete`` space of many values whose binary digits have separate meanings, such as flags packed into one
+    number: a model can then learn each bit separately. If the digits have no meaning, keep the number.
 
     Args:
         env: an environment whose observation space is Discrete.
 
     Raises:
-        TypeError: it is not.
+        TypeError: the observation space is not Discrete.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
@@ -152,7 +152,7 @@ class Bits(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArg
         return ((int(observation) - self._low) >> self._shifts & 1).astype(np.int8)
 
     def number(self, bits: NDArray[Any]) -> NDArray[np.int64]:
-        """The numbers [...] that digits [..., bits] stand for; the inverse of ``observation``."""
+        """The numbers [...] of digits [..., bits]; the inverse of ``observation``."""
         weighed: NDArray[np.int64] = (np.asarray(bits, dtype=np.int64) << self._shifts).sum(axis=-1) + self._low
         return weighed
 
@@ -167,7 +167,7 @@ def _parts(space: spaces.Space[Any], path: tuple[Any, ...] = ()) -> Iterator[tup
 
 
 def _space_of(cardinalities: NDArray[np.int64]) -> spaces.MultiBinary | spaces.MultiDiscrete[Any] | spaces.Box:
-    """The space of variables with so many values each; a Box where those are no more than declared (see FactoredSpace)."""
+    """The space of variables with these numbers of values; a Box if a variable is open (see FactoredSpace)."""
     if (cardinalities == 2).all():
         return spaces.MultiBinary(cardinalities.shape)
     if cardinalities.max() <= MAX_DECLARED:
@@ -176,7 +176,7 @@ def _space_of(cardinalities: NDArray[np.int64]) -> spaces.MultiBinary | spaces.M
 
 
 def _batch(value: Any) -> Any:
-    """A batch of one, laid out as ``batch_space`` does."""
+    """A batch of one in the form of ``batch_space``."""
     if isinstance(value, dict):
         return {key: _batch(part) for key, part in value.items()}
     if isinstance(value, tuple):

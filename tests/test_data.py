@@ -1,4 +1,4 @@
-"""Rows in memory and in files: narrow, whole, and refused where they are of another world."""
+"""Transitions in memory and in files: narrow types, complete rows, and rejection of rows of another environment."""
 
 import threading
 from dataclasses import replace
@@ -66,9 +66,9 @@ def test_rows_are_the_same_in_memory_and_in_a_folder(in_folder: bool, tmp_path: 
     assert same(data.split(0.1, 0)[0], rows.select(~data.held_out(0.1, 0)))
 
 
-def test_a_folder_is_gone_on_with_and_what_was_cut_short_is_left_out(tmp_path: Path) -> None:
+def test_a_folder_is_continued_and_incomplete_rows_are_ignored(tmp_path: Path) -> None:
     TransitionDataset(CARDINALITIES, 4, tmp_path).append(batch(30))
-    with (tmp_path / "states.bin").open("ab") as file:  # the computer went off while rows were written
+    with (tmp_path / "states.bin").open("ab") as file:  # an interrupted write
         file.write(b"12345")
     data = TransitionDataset.load(tmp_path)
     assert same(data.rows(), batch(30))
@@ -76,7 +76,7 @@ def test_a_folder_is_gone_on_with_and_what_was_cut_short_is_left_out(tmp_path: P
     assert same(TransitionDataset.load(tmp_path).rows().select(np.arange(30, 50)), batch(20, seed=1))
 
 
-def test_many_rows_of_mapped_files_are_mapped_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_selections_of_mapped_rows_are_mapped_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(data_module, "_MAPPED", 50)
     data, some = TransitionDataset(CARDINALITIES, 4, tmp_path), np.arange(0, 30, 2)
     data.append(batch(30))
@@ -87,11 +87,11 @@ def test_many_rows_of_mapped_files_are_mapped_too(tmp_path: Path, monkeypatch: p
     assert not isinstance(data.rows().select(some[:2]).before, np.memmap)
 
 
-def test_folders_of_another_world_are_refused(tmp_path: Path) -> None:
+def test_folders_of_another_environment_are_refused(tmp_path: Path) -> None:
     TransitionDataset(CARDINALITIES, 4, tmp_path)
     with pytest.raises(ValueError, match="another environment"):
         TransitionDataset((2, 2), 4, tmp_path)
-    with pytest.raises(ValueError, match="no folder of transitions"):
+    with pytest.raises(ValueError, match="not a folder of transitions"):
         TransitionDataset.load(tmp_path / "..")
 
 
@@ -115,11 +115,11 @@ def test_values_are_checked_factor_by_factor_and_columns_by_their_length() -> No
     assert len(data) == 0
 
 
-def test_two_datasets_do_not_write_over_each_other(tmp_path: Path) -> None:
+def test_two_datasets_do_not_overwrite_each_other(tmp_path: Path) -> None:
     one, other = (TransitionDataset(CARDINALITIES, 4, folder=tmp_path / "rows") for _ in range(2))
     one.append(batch(20))
     seen = one.rows().states.copy()
-    with pytest.raises(ValueError, match="load it anew"):
+    with pytest.raises(ValueError, match="load it again"):
         other.append(batch(2, 1))
     one.append(batch(2, 1))
     assert np.array_equal(one.rows().states[:20], seen)
@@ -141,7 +141,7 @@ def test_rows_that_are_added_while_another_thread_reads_are_not_lost(monkeypatch
     adding = threading.Thread(target=lambda: data.append(batch(3)))
 
     def slowly(parts: Any) -> Any:
-        if adding.ident is None:  # in the middle of the first merge
+        if adding.ident is None:  # during the first merge
             adding.start()
             adding.join(0.1)
         return merge(parts)

@@ -17,7 +17,7 @@ TABLE, REWARDS = random_table(5, 2, 4), np.array([0.0, 1.0, -1.0, 0.5, 2.0])
 
 
 class KnownWorld(TableWorld):
-    """A table world that needs no learning."""
+    """A TableWorld with start states, so that it needs no learning."""
 
     def start_states(self, n: int) -> Ints:
         return np.arange(min(n, len(self.table)))[:, None]
@@ -36,22 +36,22 @@ def flier_catcher(policy: str) -> ModelLearningAgent:
 
 
 @pytest.mark.parametrize("policy", ["MctsPolicy", "ValueIterationPolicy"])
-def test_a_solved_machine_is_explained_by_its_exact_values(policy: str) -> None:
+def test_a_solved_mdp_is_explained_by_its_exact_values(policy: str) -> None:
     why = agent_for(policy).explain(np.array(2))
     np.testing.assert_allclose(why.values, optimal_q(TABLE, REWARDS, 0.9)[2], atol=1e-4)
     assert why.machine_states == 5
-    assert why.visits.tolist() == why.errors.tolist() == [0.0, 0.0]  # neither simulations nor draws play a part
+    assert why.visits.tolist() == why.errors.tolist() == [0.0, 0.0]  # neither simulations nor samples are used
     assert why.chosen[why.best] == 1.0
     assert "5 states" in why.table()
 
 
-def test_a_known_model_with_a_goal_of_its_own_plans_at_once() -> None:
-    # The goal used to be given before the planner had the model.
+def test_an_exact_model_with_a_custom_goal_plans_without_learning() -> None:
+    # Regression test: the goal was set before the planner had the model.
     exact = optimal_q(TABLE, REWARDS, 0.9)
     assert agent_for("MctsPolicy").predict(np.arange(5))[0].tolist() == exact.argmax(axis=1).tolist()
 
 
-def test_futures_follow_the_best_behaviour_and_tell_its_rewards() -> None:
+def test_futures_follow_the_best_policy_and_contain_its_rewards() -> None:
     best = optimal_q(TABLE, REWARDS, 0.9).argmax(axis=1)
     why = agent_for("MctsPolicy").explain(np.array(0), n_futures=4, n_steps=3)
     for action, futures in enumerate(why.futures):
@@ -90,12 +90,12 @@ def same(one: Explanation, other: Explanation) -> None:
 
 
 def test_the_standard_error_is_that_of_a_mean_of_simulations() -> None:
-    # Every step pays the toss of a coin, 0 or 1: the discounted return of one simulation has a known variance.
+    # Each reward is 0 or 1 at random, so the discounted return of a simulation has a known variance.
     agent = agent_for("FlatMonteCarloPolicy", np.full((2, 2, 2), 0.5), num_simulations=200, horizon=8)
     why = agent.explain(np.array(0))
     expected = np.sqrt(0.25 * sum(0.81**k for k in range(8)) / 100)
     assert why.visits.tolist() == [100.0, 100.0]
-    # The standard deviation of 8 normal numbers lies within a factor of 2 but for one time in a hundred.
+    # The sample standard deviation of 8 normal numbers is within a factor of 2 with probability 0.99.
     assert (why.errors / expected > 0.5).all()
     assert (why.errors / expected < 2.0).all()
     assert why.chosen.sum() == pytest.approx(1.0)
@@ -104,7 +104,7 @@ def test_the_standard_error_is_that_of_a_mean_of_simulations() -> None:
 
 
 @pytest.mark.parametrize("policy", POLICIES)
-def test_imagined_futures_can_be_drawn_by_the_game_itself(policy: str) -> None:
+def test_simulated_futures_can_be_drawn_by_the_game(policy: str) -> None:
     agent = flier_catcher(policy)
     game, obs = FlierCatcher(), gym.make("mbagent/FlierCatcher-v0").reset(seed=2)[0]
     why = agent.explain(obs)
@@ -121,7 +121,7 @@ def test_imagined_futures_can_be_drawn_by_the_game_itself(policy: str) -> None:
 
 
 class Nested(Corridor):
-    """The corridor with an observation of parts and an action of two switches, one of which does nothing."""
+    """The corridor with a nested observation and an action of two switches, one of which has no effect."""
 
     def __init__(self) -> None:
         super().__init__(4, limit=20)
@@ -159,7 +159,7 @@ def test_the_table_shows_the_best_actions_only() -> None:
     assert "<- taken" in text
 
 
-def test_what_cannot_be_explained_is_said_in_a_sentence() -> None:
+def test_requests_that_cannot_be_explained_raise_an_error_of_one_sentence() -> None:
     agent = ModelLearningAgent("MctsPolicy", Corridor(), reward=arrival, seed=0)
     with pytest.raises(ValueError, match="learned nothing yet, so there is nothing to explain"):
         agent.explain(np.array(0))

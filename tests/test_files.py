@@ -1,4 +1,4 @@
-"""Files are whole or not there, whenever their writer is killed, and whoever writes beside it."""
+"""Atomic writing of files, with killed and concurrent writers."""
 
 import io
 import os
@@ -18,11 +18,11 @@ from mbagent.data import TransitionDataset
 from tests.test_data import CARDINALITIES, batch, same
 
 STEPS = {"fsync", "truncate", "rename", "replace", "flock", "mkdir", "unlink"}
-"""Calls before each of which a writer is killed; and before every tenth ``write``."""
+"""A writer is killed before each of these calls, and before every tenth ``write``."""
 
 
 def killed(work: Callable[[], None], step: int) -> bool:
-    """Whether ``work``, in a process of its own, was killed before its call number ``step`` of those that change files."""
+    """Whether ``work``, in a subprocess, was killed before its call number ``step`` among those that change files."""
     child = os.fork()
     if child == 0:
         left, writes = step, 0
@@ -143,7 +143,7 @@ def test_writers_at_one_path_do_not_hinder_each_other(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_file_taken_for_abandoned_before_it_was_locked_is_begun_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_removed_before_it_was_locked_is_created_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stolen: list[str] = []
     lock = files._lock
 
@@ -160,7 +160,7 @@ def test_a_file_taken_for_abandoned_before_it_was_locked_is_begun_again(tmp_path
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])
-def test_a_failing_write_leaves_the_old_file_and_nothing_else(step: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_write_leaves_only_the_old_file(step: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "rows.npz"
     dataset(30).save(path)
 
@@ -175,7 +175,7 @@ def test_a_failing_write_leaves_the_old_file_and_nothing_else(step: str, tmp_pat
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_folder_whose_disk_was_full_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_can_be_continued_after_the_disk_was_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data, calls = TransitionDataset(CARDINALITIES, 4, tmp_path), []
     data.append(batch(30))
 
@@ -192,14 +192,14 @@ def test_a_folder_whose_disk_was_full_goes_on_where_it_was(tmp_path: Path, monke
     assert len(data) == folder_rows(tmp_path) == 50
 
 
-def test_a_column_that_lost_rows_is_said_to_have(tmp_path: Path) -> None:
+def test_a_column_with_missing_rows_raises_an_error(tmp_path: Path) -> None:
     TransitionDataset(CARDINALITIES, 4, tmp_path).append(batch(30))
     os.truncate(tmp_path / "rewards.bin", 8 * 12)
     with pytest.raises(ValueError, match="only 12 of the 30 rows"):
         TransitionDataset.load(tmp_path)
 
 
-def test_folders_of_before_rows_were_counted_are_read(tmp_path: Path) -> None:
+def test_folders_without_a_number_of_rows_are_read(tmp_path: Path) -> None:
     TransitionDataset(CARDINALITIES, 4, tmp_path).append(batch(30))
     (tmp_path / "dataset.json").write_text('{"cardinalities": [2, 3, 300], "n_actions": 4}', encoding="utf-8")
     assert folder_rows(tmp_path) == 30
@@ -207,7 +207,7 @@ def test_folders_of_before_rows_were_counted_are_read(tmp_path: Path) -> None:
     assert folder_rows(tmp_path) == 50
 
 
-def test_symbolic_links_stay_and_what_they_point_to_is_written(tmp_path: Path) -> None:
+def test_symbolic_links_are_kept_and_their_targets_written(tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     for name in ("old", "dangling"):
         (tmp_path / name).symlink_to(Path("there") / name)
@@ -234,13 +234,13 @@ def test_permissions_are_those_of_a_new_file_or_of_the_one_replaced(tmp_path: Pa
         os.umask(before)
 
 
-def test_long_names_have_room_for_the_temporary_one(tmp_path: Path) -> None:
+def test_long_names_leave_room_for_temporary_names(tmp_path: Path) -> None:
     for name in ("a" * 255, "é" * 127):
         files.write(tmp_path / name, "all")
         assert (tmp_path / name).read_text() == "all"
 
 
-def test_what_cannot_be_written_to_is_told_in_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unwritable_paths_raise_an_error_of_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("kept")
     with pytest.raises(IsADirectoryError, match="is a folder; give the path of a file"):
         files.write(tmp_path, "x")
@@ -290,7 +290,7 @@ def test_open_files_are_written_to_and_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "act", [lambda p: dataset(3).save(p), lambda p: written_agent(p, 3), TransitionDataset.load, checkpoint.read]
 )
-def test_no_path_at_all_is_told_in_one_sentence(act: Callable[[Any], None]) -> None:
+def test_invalid_paths_raise_an_error_of_one_sentence(act: Callable[[Any], None]) -> None:
     for wrong in (None, 3):
         with pytest.raises(TypeError, match="a path or an open binary file, got"):
             act(wrong)
@@ -305,7 +305,7 @@ def test_missing_files_are_named(tmp_path: Path) -> None:
         checkpoint.read(tmp_path / "agent.zip")
 
 
-def test_files_that_are_no_table_are_told_to_be_none_without_advice_to_read_pickles(tmp_path: Path) -> None:
+def test_files_that_are_no_table_raise_an_error_without_advice_to_read_pickles(tmp_path: Path) -> None:
     np.save(tmp_path / "objects.npy", np.array([{}]), allow_pickle=True)
     np.save(tmp_path / "numbers.npy", np.arange(3))
     np.savez(tmp_path / "lacks.npz", states=np.arange(3))
@@ -322,7 +322,7 @@ def test_files_that_are_no_table_are_told_to_be_none_without_advice_to_read_pick
     np.savez(tmp_path / "pickled.npz", **{**table, "rewards": np.array([{}])}, allow_pickle=True)
     (tmp_path / "rows.npz").unlink()
     for path in sorted(tmp_path.iterdir()):
-        with pytest.raises(ValueError, match=r"is no table of transitions that save_transitions wrote") as caught:
+        with pytest.raises(ValueError, match=r"is not a table of transitions written by save_transitions") as caught:
             TransitionDataset.load(path)
         assert path.name in str(caught.value)
         assert "allow_pickle" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""What was learned as an environment of its own."""
+"""The learned model as an environment."""
 
 from typing import Any
 
@@ -47,18 +47,18 @@ def test_it_passes_the_checks_of_gymnasium_and_sb3(kind: str) -> None:
     env = LearnedEnv(learned(worlds[kind]), max_episode_steps=20)
     assert env.observation_space == worlds[kind].observation_space
     check_env(env, skip_render_check=True)
-    if kind != "tuple":  # which SB3's checker does not know
+    if kind != "tuple":  # not supported by SB3's checker
         sb3_check_env(env)
 
 
-def test_it_is_the_world_that_was_met() -> None:
+def test_it_equals_a_fully_observed_environment() -> None:
     real, env = Corridor(limit=50), LearnedEnv(learned(Corridor(limit=50)), max_episode_steps=50)
-    assert played(env, 1) == played(real, 1)  # a world without luck: steps, rewards, ends
+    assert played(env, 1) == played(real, 1)  # a deterministic environment: steps, rewards, terminations
     assert env.reset(seed=3)[1] == {}
 
 
 class Coin(Corridor):
-    """Starts at 0 three times as often as at 2; a step moves by luck."""
+    """Starts at 0 three times as often as at 2; steps move at random."""
 
     def reset(self, **kwargs: Any) -> Any:
         _, info = super().reset(**kwargs)
@@ -69,7 +69,7 @@ class Coin(Corridor):
         return super().step(int(self.np_random.random() < 0.7) if action else 0)
 
 
-def test_starts_and_luck_are_as_often_as_they_were_met() -> None:
+def test_start_states_and_random_steps_have_the_observed_frequencies() -> None:
     env = LearnedEnv(learned(Coin(limit=10), lambda obs, action, next_obs: next_obs, steps=6000), max_episode_steps=10)
     starts = np.array([env.reset(seed=i)[0] for i in range(400)])
     assert set(starts) == {0, 2}
@@ -85,7 +85,7 @@ def test_starts_and_luck_are_as_often_as_they_were_met() -> None:
     assert played(env, 7) != played(env, 8)
 
 
-def test_any_reward_may_be_tried() -> None:
+def test_any_reward_can_be_used() -> None:
     agent = learned(Corridor(limit=50))
     weights = agent.get_parameters()["policy"]
     env = LearnedEnv(agent, lambda obs, action, next_obs: -1.0 * (next_obs == 1), max_episode_steps=5)
@@ -94,7 +94,7 @@ def test_any_reward_may_be_tried() -> None:
     *_, terminated, truncated, _ = [env.step(0) for _ in range(4)][-1]
     assert (terminated, truncated) == (False, True)
     agent.set_reward(lambda obs, action, next_obs: 5.0 * (next_obs == 1))
-    env = LearnedEnv(agent)  # what the agent plans for now
+    env = LearnedEnv(agent)  # the agent's current goal
     env.reset(seed=0)
     assert env.step(1)[1] == 5.0
     for name, value in agent.get_parameters()["policy"].items():
@@ -125,7 +125,7 @@ def test_mistakes_are_named() -> None:
 
 
 @pytest.mark.parametrize("agent", [None, "agent.zip"])
-def test_what_is_no_agent_is_refused(agent: Any) -> None:
+def test_an_invalid_agent_is_refused(agent: Any) -> None:
     with pytest.raises(TypeError, match="LearnedEnv needs an agent"):
         LearnedEnv(agent)
 

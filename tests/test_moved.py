@@ -1,4 +1,4 @@
-"""Module paths of the version before still work, with a warning that names the new ones."""
+"""Module paths of the previous version still work, with a warning that names the new ones."""
 
 import importlib
 import sys

@@ -1,4 +1,4 @@
-"""Rewards that change while learning goes on are told from rewards that are random."""
+"""Rewards that change during learning are distinguished from random rewards."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -36,7 +36,7 @@ def walk(n: int, reward: Callable[[int, int, np.random.Generator], float], episo
 
 
 def learned(rows: TransitionBatch) -> tuple[Any, Any]:
-    """The report, and what is learned of arriving at each cell by standing still."""
+    """The report, and the learned reward of staying at each cell."""
     model, cells = LearnedReward((SIZE,), 3), np.arange(SIZE)[:, None]
     report = model.fit(rows)
     return report, model(cells, np.ones(SIZE, dtype=np.int64), cells)
@@ -47,7 +47,7 @@ def at(*cells: int) -> Any:
 
 
 @pytest.mark.parametrize(("old", "new", "episode"), [(2500, 500, 50), (1000, 2000, 50), (2500, 800, 10**6)])
-def test_recent_rewards_outvote_old_ones(old: int, new: int, episode: int) -> None:
+def test_recent_rewards_replace_old_ones(old: int, new: int, episode: int) -> None:
     report, rewards = learned(walk(old + new, lambda t, cell, rng: float(cell == (3 if t < old else 7)), episode))
     assert report.since == pytest.approx(old, abs=20)
     assert (report.right, report.contrary) == (1.0, 0.0)
@@ -64,7 +64,7 @@ def test_the_last_of_several_changes_counts() -> None:
     np.testing.assert_array_equal(rewards, at(5))
 
 
-def test_what_was_not_observed_again_still_holds() -> None:
+def test_rewards_that_were_not_observed_again_are_kept() -> None:
     def reward(t: int, cell: int, rng: np.random.Generator) -> float:
         return -10.0 * (cell == 9) + (cell == (3 if t < 2500 else 6))
 
@@ -82,7 +82,7 @@ def test_random_rewards_that_do_not_change_are_learned_from_all() -> None:
 
 @pytest.mark.parametrize("episode", [1, 20, 100])
 @pytest.mark.parametrize("seed", range(5))
-def test_what_varies_from_episode_to_episode_is_no_change(episode: int, seed: int) -> None:
+def test_variation_between_episodes_is_no_change(episode: int, seed: int) -> None:
     goals = np.random.default_rng(seed).choice([3, 7], 3000)
     rows = walk(3000, lambda t, cell, rng: float(cell == goals[t // episode]), episode, seed)
     assert turn(triples(rows), rows.rewards.astype(np.int64), rows.episodes) == 0
@@ -100,7 +100,7 @@ def test_many_rewards_change_too() -> None:
     np.testing.assert_allclose(rewards, -abs(np.arange(SIZE) - 7), atol=0.2)
 
 
-def test_transitions_that_never_come_back_are_told_by_what_they_have_in_common() -> None:
+def test_transitions_that_never_recur_are_predicted_by_their_common_features() -> None:
     rows, planes = pictures(2000), FactoredSpace(spaces.MultiBinary((2, 5, 5))).planes
     model = LearnedReward((2,) * 50, 2, planes)
     report = model.fit(replace(rows, rewards=np.where(np.arange(2000) < 1000, rows.rewards, -rows.rewards)))
@@ -115,7 +115,7 @@ def test_rewards_observed_late_are_no_change() -> None:
     assert LearnedReward((2,) * 50, 2, planes).fit(replace(late, episodes=rows.episodes)).since == 0
 
 
-def test_a_function_is_right_since_a_change_or_wrong_now_and_then() -> None:
+def test_a_reward_function_is_wrong_before_a_change_or_occasionally() -> None:
     rows = walk(3000, lambda t, cell, rng: 0.0)
     of_three, t = rows.next_states[:, 0] == 3, np.arange(3000)
     assert wrong_until(rows, of_three & (t < 2000)) == pytest.approx(2000, abs=50)

@@ -25,7 +25,7 @@ OPEN = st.one_of(
     st.builds(lambda n, start: spaces.Discrete(n, start=start), st.integers(5000, 10**9), st.integers(-5, 5)),
     st.builds(lambda n: spaces.MultiDiscrete([n, 3]), st.integers(5000, 10**9)),
 )
-"""With variables of which only the values that are met count."""
+"""Spaces with open variables, of which only observed values are numbered."""
 NESTED: st.SearchStrategy[spaces.Space[Any]] = st.recursive(
     ELEMENTARY,
     lambda inner: st.one_of(
@@ -62,7 +62,7 @@ def test_encoding_and_decoding_are_exact_inverses(space: spaces.Space[Any], seed
 
 @given(inner=st.lists(st.one_of(OPEN, ELEMENTARY), min_size=1, max_size=3), alone=OPEN, seed=st.integers(0, 1000))
 @settings(max_examples=60, deadline=None)
-def test_values_that_were_met_have_exact_inverses_and_others_the_nearest(
+def test_observed_values_have_exact_inverses_and_others_the_nearest(
     inner: list[spaces.Space[Any]], alone: spaces.Space[Any], seed: int
 ) -> None:
     for space in (alone, spaces.Tuple(inner)):
@@ -71,20 +71,22 @@ def test_values_that_were_met_have_exact_inverses_and_others_the_nearest(
         batched.seed(seed)
         batch, others = batched.sample(), batched.sample()
         numbers = declared.encode(batch)
-        met = declared.with_values(numbers)
-        factors = met.encode(batch)
+        observed = declared.with_values(numbers)
+        factors = observed.encode(batch)
         assert (factors >= 0).all()
-        assert (factors < met.cardinalities).all()
-        assert same(met.decode(factors), batch)
-        np.testing.assert_array_equal(met.widen(factors), numbers)
-        new, known = declared.encode(others), met.widen(met.encode(others))
+        assert (factors < observed.cardinalities).all()
+        assert same(observed.decode(factors), batch)
+        np.testing.assert_array_equal(observed.widen(factors), numbers)
+        new, known = declared.encode(others), observed.widen(observed.encode(others))
         for factor in declared.open:
             column = new[:, factor, None]
-            values = np.unique(met.widen(np.arange(max(met.cardinalities))[:, None] % met.cardinalities)[:, factor])
+            values = np.unique(
+                observed.widen(np.arange(max(observed.cardinalities))[:, None] % observed.cardinalities)[:, factor]
+            )
             np.testing.assert_array_equal(np.abs(column - known[:, factor, None])[:, 0], np.abs(column - values).min(axis=1))
-        again = declared.from_value_arrays(met.value_arrays())
-        assert again.same_factors(met)
-        assert again.cardinalities == met.cardinalities
+        again = declared.from_value_arrays(observed.value_arrays())
+        assert again.same_factors(observed)
+        assert again.cardinalities == observed.cardinalities
 
 
 def test_cells_of_a_plane_share_their_values() -> None:
@@ -94,14 +96,14 @@ def test_cells_of_a_plane_share_their_values() -> None:
     assert space.with_values(space.encode(seen)).cardinalities == (3, 2) * 9  # 0, 7 and 8; 0 and 9
 
 
-def test_numbers_that_cannot_be_told_apart_are_refused() -> None:
+def test_numbers_beyond_the_supported_range_are_refused() -> None:
     space = FactoredSpace(spaces.Box(-(2**63), 2**63 - 1, (1,), dtype=np.int64))
     assert space.decode(space.encode(np.array([[2**61 - 1], [-(2**61)]])))[:, 0].tolist() == [2**61 - 1, -(2**61)]
-    with pytest.raises(ValueError, match="told apart"):
+    with pytest.raises(ValueError, match=r"to 2\^61 are supported"):
         space.encode(np.array([[2**62]]))
 
 
-def test_too_many_values_are_refused_when_they_are_met() -> None:
+def test_too_many_observed_values_are_refused() -> None:
     space = FactoredSpace(spaces.Discrete(100_000))
     with pytest.raises(ValueError, match="took 5000 values"):
         space.with_values(np.arange(5000)[:, None])
@@ -134,7 +136,7 @@ def test_every_joint_action_has_a_number(space: spaces.Space[Any]) -> None:
         (spaces.Box(-1.0, 1.0, (1,)), "action", TypeError, "DiscretizeAction"),
     ],
 )
-def test_unsupported_spaces_are_refused_with_the_way_out(
+def test_unsupported_spaces_are_refused_with_a_solution(
     space: spaces.Space[Any], kind: str, error: type[Exception], message: str
 ) -> None:
     with pytest.raises(error, match=message):

@@ -1,4 +1,4 @@
-"""The past as part of the observation."""
+"""Wrappers that change observations, such as adding previous ones."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ ON_WRAPPERS = pytest.mark.filterwarnings("ignore:.*different from the unwrapped 
 
 
 class Echo(gym.Env[Any, Any]):
-    """Shows the action before last: what comes next cannot be told from an observation, but from one step more."""
+    """Observes the action before the last one, so predictions need one previous step in addition to the observation."""
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - Gymnasium's own form
 
@@ -42,14 +42,14 @@ def test_a_row_holds_the_past_newest_first() -> None:
     assert obs.tolist() == [0, 0, 0, 0, 0, 0, 0, 0, 0]
     env.step(2)
     obs, *_ = env.step(1)
-    assert obs.tolist() == [2, 0, 0, 1, 0, 0, 0, 0, 1]  # now 2; before 0 and action 1; before that 0 and action 2
+    assert obs.tolist() == [2, 0, 0, 1, 0, 0, 0, 0, 1]  # now 2; previously 0 and action 1; before that 0 and action 2
     obs, _ = env.reset(seed=0)
-    assert not obs.any()  # nothing is left of the episode before
+    assert not obs.any()  # nothing remains of the previous episode
     check_env(env, skip_render_check=True)
 
 
 @ON_WRAPPERS
-def test_planes_stay_planes() -> None:
+def test_planes_remain_planes() -> None:
     env = History(gym.make("mbagent/Maneuverer-v0", size=4), 1)
     assert env.observation_space == spaces.MultiBinary((3 + 3 + 4, 4, 4))
     first, _ = env.reset(seed=1)
@@ -66,7 +66,7 @@ def test_planes_that_would_be_misread_become_a_row() -> None:
     def shape(k: int) -> tuple[int, ...] | None:
         return History(gym.make("mbagent/FlierCatcher-v0", height=4, width=6), k).observation_space.shape
 
-    assert shape(1) == (48 + 48 + 3,)  # seven channels of four rows and six columns: the columns would be taken for channels
+    assert shape(1) == (48 + 48 + 3,)  # with seven channels of four rows and six columns, columns would be mistaken for channels
     assert shape(3) == (48 + 3 * (48 + 3),)
 
 
@@ -86,7 +86,7 @@ def test_spaces_with_parts_and_wrong_numbers() -> None:
             History(Echo(), wrong)  # type: ignore[arg-type]
 
 
-def test_a_model_that_sees_one_step_more_knows_what_comes() -> None:
+def test_a_model_with_one_more_step_predicts_exactly() -> None:
     def goal(obs: np.ndarray, action: np.ndarray, following: np.ndarray) -> np.ndarray:
         return np.zeros(len(obs))
 
@@ -104,5 +104,5 @@ def test_a_model_that_sees_one_step_more_knows_what_comes() -> None:
 
 
 def test_wrappers_come_with_the_package() -> None:
-    """Messages and docs name them so."""
+    """Messages and documentation use these names."""
     assert wrappers.History is History

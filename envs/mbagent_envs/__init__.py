@@ -5,8 +5,8 @@
 >>> env = gym.make("mbagent/Maneuverer-v0", size=6, wall_density=0.2)
 >>> envs = gym.make_vec("mbagent/FlierCatcher-v0", num_envs=64)
 
-``mbagent/GeyserRunner-v0``, ``mbagent/Maneuverer-v0`` and ``mbagent/FlierCatcher-v0``; their rules and
-arguments stand in the classes of the same names.
+The ids are ``mbagent/GeyserRunner-v0``, ``mbagent/Maneuverer-v0`` and ``mbagent/FlierCatcher-v0``; the classes
+of the same names document their rules and arguments.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ ENV_IDS = tuple(f"mbagent/{name}-v0" for name in GAMES)
 
 
 def register_envs() -> None:
-    """Register the games with Gymnasium; those that are registered already are left alone."""
+    """Register the games with Gymnasium, unless they are already registered."""
     for env_id, (name, game_type) in zip(ENV_IDS, GAMES.items(), strict=True):
         if env_id not in gym.registry:
             gym.register(

@@ -1,8 +1,8 @@
-"""Pictures of scenes: pixels, characters, or a window. Knows kinds of things and how they look, but no rules.
+"""Pictures of scenes: pixels, characters, or a window. Independent of the rules of the games.
 
-Shapes are signed distances (negative inside) in units of a cell, from which smooth edges follow without
-supersampling. The tile of each kind is painted once and then pasted, so a frame costs a few dozen
-microseconds a thing.
+Shapes are signed distances (negative inside) in units of a cell, which gives smooth edges without supersampling.
+The tile of each kind of object is painted once and then copied, so a frame takes a few dozen microseconds per
+object.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class _Tile:
         self.opacity = np.zeros((cell, cell))
 
     def fill(self, distance: _Plane, colour: _Colour, opacity: float = 1.0) -> None:
-        """Paint where ``distance`` is negative, over what is there."""
+        """Paint where ``distance`` is negative, over earlier colours."""
         cover = np.clip(0.5 - distance * self.cell, 0.0, 1.0) * opacity
         total = cover + self.opacity * (1 - cover)
         share = np.divide(cover, total, out=np.zeros_like(cover), where=total > 0)[..., None]
@@ -80,7 +80,7 @@ class _Tile:
         return distance
 
     def ellipse(self, x: float, y: float, across: float, down: float) -> _Plane:
-        """Return about the distance from an ellipse with these half axes."""
+        """Return the approximate distance from an ellipse with these half axes."""
         distance: _Plane = (np.hypot((self.x - x) / across, (self.y - y) / down) - 1) * min(across, down)
         return distance
 
@@ -288,11 +288,11 @@ def draw_ansi(scene: Scene) -> str:
 
 
 class Window:
-    """A window on the screen that shows pictures at a steady pace.
+    """A window on the screen that shows pictures at a steady rate.
 
     Args:
-        title: what its bar says.
-        fps: pictures a second; `show` waits as long as that takes.
+        title: text of the title bar.
+        fps: pictures per second; `show` waits accordingly.
 
     Raises:
         gymnasium.error.DependencyNotInstalled: if pygame is missing.
@@ -311,7 +311,7 @@ class Window:
         """Show ``picture``, uint8 ``[height, width, 3]``, opening the window the first time."""
         pygame, size = self._pygame, (picture.shape[1], picture.shape[0])
         screen = pygame.display.get_surface()
-        if screen is None or screen.get_size() != size:  # pygame has one window: another one may have taken it
+        if screen is None or screen.get_size() != size:  # pygame has only one window, which another Window may be using
             pygame.display.init()
             screen = pygame.display.set_mode(size)
         pygame.display.set_caption(self._title)

@@ -30,11 +30,11 @@ RENDER_MODES = ("human", "rgb_array", "ansi")
 
 
 def resolve_game(game: str | type[Game] | Game, arguments: Mapping[str, Any]) -> Game:
-    """Return the game meant by a name of `GAMES`, ``"module:Class"``, a class, or an instance.
+    """Return the game given by a name in `GAMES`, ``"module:Class"``, a class, or an instance.
 
     Raises:
-        ValueError: if there is no such game, or an argument's value is impossible.
-        TypeError: if an argument is unknown or of the wrong type, or comes beside an instance.
+        ValueError: if there is no such game, or an argument's value is invalid.
+        TypeError: if an argument is unknown or of the wrong type, or given together with an instance.
     """
     if isinstance(game, Game):
         if arguments:
@@ -64,17 +64,17 @@ def check_options(options: Mapping[str, Any] | None, known: tuple[str, ...]) -> 
     given = dict(options or {})
     unknown = [name for name in given if name not in known]
     if unknown:
-        raise ValueError(f"reset knows no option {unknown[0]!r}; its options are {', '.join(map(repr, known))}.")
+        raise ValueError(f"reset has no option {unknown[0]!r}; its options are {', '.join(map(repr, known))}.")
     return given
 
 
 class GameEnv(gym.Env[Bits, np.int64]):
     """A game (see `mbagent_envs.Game`) as a Gymnasium environment; build it with `gymnasium.make`.
 
-    Beside Gymnasium's interface, ``env.unwrapped`` gives a planner the true rules: `game`, `reward_fn`,
-    `reward_functions`, `transition` and `transition_distribution`. At each reset one key is drawn from
-    ``np_random``, and everything random in the episode follows from it, so an episode depends on nothing but
-    the seed and the actions.
+    In addition to Gymnasium's interface, ``env.unwrapped`` gives a planner access to the true rules: `game`,
+    `reward_fn`, `reward_functions`, `transition` and `transition_distribution`. At each reset one key is drawn
+    from ``np_random``, which determines all random events of the episode, so an episode depends only on the
+    seed and the actions.
 
     Args:
         game: a game's name, ``"module:Class"``, class or instance.
@@ -83,7 +83,7 @@ class GameEnv(gym.Env[Bits, np.int64]):
 
     Raises:
         TypeError: for an unknown argument or one of the wrong type.
-        ValueError: for an impossible value.
+        ValueError: for an invalid value.
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 8}  # noqa: RUF012
@@ -91,7 +91,7 @@ class GameEnv(gym.Env[Bits, np.int64]):
     def __init__(self, game: str | type[Game] | Game, render_mode: str | None = None, **arguments: Any) -> None:
         self.game = resolve_game(game, arguments)
         self.render_mode = check_render_mode(render_mode)
-        self.observation_space = copy.deepcopy(self.game.observation_space)  # environments may share a game,
+        self.observation_space = copy.deepcopy(self.game.observation_space)  # environments can share a game,
         self.action_space = copy.deepcopy(self.game.action_space)  # but never their spaces' generators
         self._obs: Bits | None = None
         self._episode_key = np.zeros(1, dtype=np.uint64)
@@ -102,11 +102,11 @@ class GameEnv(gym.Env[Bits, np.int64]):
         """Start an episode.
 
         Args:
-            seed: seeds ``np_random``; None goes on with it.
-            options: ``{"state": obs}`` starts from this observation instead of a drawn one.
+            seed: seeds ``np_random``; None continues its sequence.
+            options: ``{"state": obs}`` starts from this observation instead of a random one.
 
         Raises:
-            ValueError: for an unknown option, or a state that is none of this game.
+            ValueError: for an unknown option, or an invalid state.
         """
         given = check_options(options, ("state",))
         start = self.game.check_observations(np.asarray(given["state"])[None]) if "state" in given else None
@@ -150,7 +150,7 @@ class GameEnv(gym.Env[Bits, np.int64]):
         return self.game.reward_functions
 
     def transition(self, obs: npt.ArrayLike, actions: npt.ArrayLike, rng: np.random.Generator) -> Bits:
-        """Sample next observations by the true rules; the environment's own state stays as it is.
+        """Sample next observations by the true rules; the environment's own state is not changed.
 
         Args:
             obs: observations ``[B, *shape]``.
@@ -161,7 +161,7 @@ class GameEnv(gym.Env[Bits, np.int64]):
             Next observations, int8 ``[B, *shape]``.
 
         Raises:
-            ValueError: if a row of ``obs`` is no state of this game.
+            ValueError: if a row of ``obs`` is not a state of this game.
             InvalidActionError: if an action is outside the action space.
         """
         states = self.game.check_observations(obs)
@@ -169,15 +169,15 @@ class GameEnv(gym.Env[Bits, np.int64]):
         return self.game.transition(states, checked, draw_keys(rng, len(states)))
 
     def transition_distribution(self, obs: npt.ArrayLike, action: int) -> tuple[Bits, Floats]:
-        """List what may follow one observation, ``[*shape]``, and one action.
+        """List the possible next observations after one observation, ``[*shape]``, and one action.
 
         Returns:
             The distinct next observations, int8 ``[M, *shape]``, and their probabilities, float64 ``[M]``.
 
         Raises:
-            ValueError: if ``obs`` is no state of this game.
+            ValueError: if ``obs`` is not a state of this game.
             InvalidActionError: if the action is outside the action space.
-            NotImplementedError: if the successors are too many to list.
+            NotImplementedError: if there are too many successors to list.
         """
         state = self.game.check_observations(np.asarray(obs)[None])[0]
         checked = self.game.check_actions(np.asarray(action)[None], 1)
@@ -188,7 +188,7 @@ class GameEnv(gym.Env[Bits, np.int64]):
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
-            gymnasium.error.DependencyNotInstalled: if a window is wanted and pygame is missing.
+            gymnasium.error.DependencyNotInstalled: if a window is requested and pygame is missing.
         """
         if self.render_mode is None:
             gym.logger.warn("render() was called without a render_mode; give one to gymnasium.make, say 'rgb_array'.")

@@ -1,4 +1,4 @@
-"""FlierCatcher: catch what flies in from the right."""
+"""FlierCatcher: catch fliers that arrive from the right."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ def _transition(obs: Bits, moves: Bits, keys: Keys, spawn_rate: float, out: Bits
 
 
 class FlierCatcher(Game):
-    """A catcher moves up and down the left edge and touches what flies in from the right.
+    """A catcher moves up and down the left edge and catches fliers that arrive from the right.
 
     ## Description
-    Fliers enter at the right edge, one at most at a time, and fly straight to the left, a column a step.
-    Those that reach the player's cell are caught; the others are gone. Not all can be reached, so a good
-    player looks ahead and chooses the path that catches most. After Braylan and Miikkulainen (2015), section
-    5; staying in place is our addition.
+    Fliers enter at the right edge, at most one at a time, and fly straight to the left, one column per step.
+    Those that reach the player's cell are caught; the others disappear. Not all can be reached, so a good
+    player plans ahead and chooses the path on which most can be caught. After Braylan and Miikkulainen (2015),
+    section 5; staying in place is our addition.
 
     ## Action Space
     `Discrete(3)`; without `stay` it is `Discrete(2)`, numbered in the same order.
@@ -56,11 +56,11 @@ class FlierCatcher(Game):
     the fliers; row 0 is the top.
 
     ## Starting State
-    The player at a uniform row of the first column; no fliers.
+    The player at a uniformly random row of the first column; no fliers.
 
     ## Transition
-    The player moves (the edges stop him), all fliers move one column to the left (those in the first vanish),
-    then with probability `spawn_rate` a new one appears at a uniform row of the last column.
+    The player moves (but not beyond the edges), all fliers move one column to the left (those in the first column
+    disappear), then with probability `spawn_rate` a new one appears at a uniformly random row of the last column.
 
     ## Rewards
     1 when, after the step, a flier is at the player's cell, else 0.
@@ -80,7 +80,7 @@ class FlierCatcher(Game):
     - `"avoid"`: -1 for every flier that touches the player.
     - `"top row"`: 1 for standing in the top row.
     - `"catch low"`: 1 for a flier touched in the lower half, -1 for one touched in the upper half.
-    - `"follow"`: 1 while a flier is in the column next to the player, in his row.
+    - `"follow"`: 1 while a flier is in the column next to the player, in the same row.
 
     ## Version History
     - v0: first version.
@@ -136,7 +136,7 @@ class FlierCatcher(Game):
         return as_floats((next_obs[:, 0, :, 0] & next_obs[:, 1, :, 1]).any(axis=1))
 
     def transition_distributions(self, obs: Bits, actions: npt.NDArray[Any]) -> tuple[Bits, Floats]:
-        """Enumerate the new flier's rows, and none; see `Game.transition_distributions`."""
+        """Enumerate the new flier's rows, and no new flier; see `Game.transition_distributions`."""
         following = self.transition(obs, actions, np.zeros(len(obs), dtype=np.uint64))
         following[:, 1, :, -1] = 0
         outcomes = np.repeat(following[:, None], self.height + 1, axis=1)
@@ -146,7 +146,7 @@ class FlierCatcher(Game):
         return outcomes, probabilities
 
     def invalid(self, obs: Bits) -> str | None:
-        """Say what makes a row no state of this game; see `Game.invalid`."""
+        """Describe why a row is not a state of this game; see `Game.invalid`."""
         if (obs[:, 0, :, 0].sum(axis=1) != 1).any() or obs[:, 0, :, 1:].any():
             return "plane 0 must hold exactly one 1, in its first column (the player)"
         if (obs[:, 1].sum(axis=1) > 1).any():
@@ -154,7 +154,7 @@ class FlierCatcher(Game):
         return None
 
     def scene(self, obs: Bits) -> Scene:
-        """Return the board, one cell each."""
+        """Return the board with one sprite per object."""
         fliers = [Sprite("flier", int(row), int(column)) for row, column in np.argwhere(obs[1])]
         player = "player scoring" if (obs[0] & obs[1]).any() else "player"
         return Scene("sky", self.height, self.width, (*fliers, Sprite(player, int(obs[0, :, 0].argmax()), 0)))

@@ -1,8 +1,8 @@
-"""What a game is: a few pure functions on batches of observations, with no memory of their own.
+"""Interface of the games: a few pure functions on batches of observations, without internal state.
 
-An observation is the whole state. Everything random comes from keys (`mbagent_envs.random_keys`), one a row,
-so the same functions serve one environment, a thousand of them at once, and a planner that simulates with the
-true rules.
+An observation is the whole state. All randomness comes from keys (`mbagent_envs.random_keys`), one per row, so the
+same functions are used by a single environment, by a vector environment, and by a planner that simulates with
+the true rules.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class InvalidActionError(gym.error.InvalidAction, ValueError):
 
 @dataclass(frozen=True)
 class Sprite:
-    """One thing to draw: its kind (a key of `mbagent_envs.drawing.SYMBOLS`) at a cell, row 0 on top."""
+    """One object to draw: its kind (a key of `mbagent_envs.drawing.SYMBOLS`) and its cell, row 0 on top."""
 
     kind: str
     row: int
@@ -46,7 +46,7 @@ class Sprite:
 
 @dataclass(frozen=True)
 class Scene:
-    """What a picture shows: a board of cells and the things on it, painted in the order given.
+    """The content of a picture: a board of cells and the objects on it, painted in the given order.
 
     ``background`` is a key of `mbagent_envs.drawing.BACKGROUNDS`.
     """
@@ -61,16 +61,15 @@ class Game(ABC):
     """The rules of a game as pure functions on batches; ``B`` below is the batch size.
 
     Subclasses take their arguments as keywords, set the attributes below, and call ``super().__init__`` with
-    the goals. Instances are immutable in practice: nothing changes them after construction, so one may be
-    shared freely.
+    the goals. Instances are not changed after construction, so they can be shared.
     """
 
     action_names: tuple[str, ...]
-    """What each action does, by number."""
+    """Effect of each action, by number."""
     observation_space: MultiBinary
     action_space: Discrete[np.int64]
     max_episode_steps: ClassVar[int]
-    """Steps after which an episode is truncated unless `gymnasium.make` is told otherwise."""
+    """Steps after which an episode is truncated unless another limit is given to `gymnasium.make`."""
 
     def __init__(
         self,
@@ -79,7 +78,7 @@ class Game(ABC):
         action_names: tuple[str, ...],
         goals: Mapping[str, RewardFn],
     ) -> None:
-        """Build the spaces and the mapping of goals (``"default"``, the game's own reward, comes first)."""
+        """Build the spaces and the mapping of goals (``"default"``, the game's own reward, is the first)."""
         self.action_names = action_names
         self.observation_space = MultiBinary(observation_shape)
         self.action_space = Discrete(len(action_names))
@@ -92,7 +91,7 @@ class Game(ABC):
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """The keyword arguments with which an equal game can be built again."""
+        """The keyword arguments with which an equal game can be built."""
         return {name: getattr(self, name) for name in argument_names(type(self))}
 
     def __repr__(self) -> str:
@@ -109,8 +108,8 @@ class Game(ABC):
         """Take one step in every row.
 
         Args:
-            obs: int8 ``[B, *shape]``; taken on trust (see `check_observations`).
-            actions: integers ``[B]``; taken on trust (see `check_actions`).
+            obs: int8 ``[B, *shape]``; not checked (see `check_observations`).
+            actions: integers ``[B]``; not checked (see `check_actions`).
             keys: uint64 ``[B]``; row ``b`` of the result depends on row ``b`` of the arguments only.
 
         Returns:
@@ -122,11 +121,11 @@ class Game(ABC):
         """Return the game's own reward, float64 ``[B]``, of transitions laid out as in `transition`."""
 
     def terminated(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Bools:
-        """Return which transitions end the episode, bool ``[B]``; by default none does."""
+        """Return whether each transition ends the episode, bool ``[B]``; by default none does."""
         return np.zeros(len(next_obs), dtype=np.bool_)
 
     def transition_distribution(self, obs: Bits, action: int) -> tuple[Bits, Floats]:
-        """Enumerate what may follow one observation and action.
+        """Enumerate the possible next observations after one observation and action.
 
         Args:
             obs: int8 ``[*shape]``.
@@ -137,14 +136,14 @@ class Game(ABC):
             all positive.
 
         Raises:
-            NotImplementedError: if the successors are too many to list.
+            NotImplementedError: if there are too many successors to list.
         """
         outcomes, probabilities = self.transition_distributions(obs[None], np.array([action]))
         possible = probabilities[0] > 0
         return outcomes[0, possible], probabilities[0, possible]
 
     def transition_distributions(self, obs: Bits, actions: npt.NDArray[Any]) -> tuple[Bits, Floats]:
-        """Enumerate what may follow, for a batch; games that can list their successors override this.
+        """Enumerate possible next observations for a batch; games that can list their successors override this.
 
         Args:
             obs: int8 ``[B, *shape]``.
@@ -155,23 +154,23 @@ class Game(ABC):
             ``[B, M]``, some of which may be zero.
 
         Raises:
-            NotImplementedError: if the successors are too many to list.
+            NotImplementedError: if there are too many successors to list.
         """
         raise NotImplementedError(f"{type(self).__name__} cannot list its successors; sample them with transition().")
 
     @abstractmethod
     def scene(self, obs: Bits) -> Scene:
-        """Return what a picture of one observation, int8 ``[*shape]``, shows."""
+        """Return the scene of one observation, int8 ``[*shape]``, for drawing."""
 
     @abstractmethod
     def invalid(self, obs: Bits) -> str | None:
-        """Say briefly what makes a row of ``obs``, bits ``[B, *shape]``, no state of this game, or None."""
+        """Describe briefly why a row of ``obs``, bits ``[B, *shape]``, is not a state of this game; None if all are."""
 
     def check_observations(self, obs: npt.ArrayLike) -> Bits:
         """Return a batch of observations as contiguous int8 ``[B, *shape]``.
 
         Raises:
-            ValueError: if the shape is wrong or a row is no state of this game.
+            ValueError: if the shape is wrong or a row is not a state of this game.
         """
         array = np.asarray(obs)
         shape = self.observation_space.shape
@@ -212,8 +211,8 @@ def build_game(game_type: type[Game], arguments: Mapping[str, Any]) -> Game:
     """Build a game from keyword arguments.
 
     Raises:
-        TypeError: if an argument is unknown; the message names the nearest known one.
-        ValueError: if a value is impossible (raised by the game itself, as TypeError is for a wrong type).
+        TypeError: if an argument is unknown; the message names the most similar known one.
+        ValueError: if a value is invalid (raised by the game itself, as is TypeError for a wrong type).
     """
     known = argument_names(game_type)
     for name in arguments:
@@ -225,7 +224,7 @@ def build_game(game_type: type[Game], arguments: Mapping[str, Any]) -> Game:
 
 
 def check_integer(name: str, value: object, minimum: int) -> int:
-    """Return ``value`` as an int of at least ``minimum``; TypeError or ValueError name the argument."""
+    """Return ``value`` as an int of at least ``minimum``; TypeError and ValueError name the argument."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
         raise TypeError(f"{name} must be an integer, but it is {value!r} of type {type(value).__name__}.")
     if value < minimum:
@@ -234,7 +233,7 @@ def check_integer(name: str, value: object, minimum: int) -> int:
 
 
 def check_number(name: str, value: object, minimum: float, maximum: float, *, below: bool = False) -> float:
-    """Return ``value`` as a finite float in [minimum, maximum], or below the maximum; errors name the argument."""
+    """Return ``value`` as a finite float in [minimum, maximum], or, with ``below``, in [minimum, maximum)."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise TypeError(f"{name} must be a number, but it is {value!r} of type {type(value).__name__}.")
     if not (minimum <= value <= maximum and np.isfinite(value)) or (below and value == maximum):

@@ -46,12 +46,12 @@ class GeyserRunner(Game):
     """A runner earns more the further right he stands, but the right half of the field is full of geysers.
 
     ## Description
-    A field of `width` columns. Under each column of the right half lies a geyser, and exactly one of them
-    erupts at any time. In the deterministic mode the eruptions follow a fixed cycle, and a good player runs
-    all the way to the right, stepping aside only when about to be hit. In the stochastic mode nobody knows
-    which comes next: when a hit costs little he runs straight through to the right edge; when it costs much
-    he stops at the last safe column (for `width=10` the break-even is `hit_cost = 25/9`). After Braylan and
-    Miikkulainen (2015), section 4; staying in place is our addition.
+    A field of `width` columns. Under each column of the right half there is a geyser, and exactly one of them
+    erupts at any time. In the deterministic mode the eruptions follow a fixed cycle, and a good player runs to the
+    right edge, stepping aside only to avoid a hit. In the stochastic mode the next eruption is unpredictable: if
+    the cost of a hit is low, a good player runs straight to the right edge; if it is high, he stops at the last
+    safe column (for `width=10` the break-even is `hit_cost = 25/9`). After Braylan and Miikkulainen (2015),
+    section 4; staying in place is our addition.
 
     ## Action Space
     `Discrete(3)`; without `stay` it is `Discrete(2)`, numbered in the same order.
@@ -65,12 +65,12 @@ class GeyserRunner(Game):
     eruption, one-hot over the columns of the right half, from left to right.
 
     ## Starting State
-    The player at column 0; the eruption uniform.
+    The player at column 0; the eruption is uniformly random.
 
     ## Transition
-    The player moves (the edges stop him), then the next eruption comes. Stochastic: uniform over the `g =
+    The player moves (but not beyond the edges), then the next geyser erupts. Stochastic: uniform over the `g =
     width // 2` geysers. Deterministic: geyser `k` is followed by `(k + m) mod g`, where `m` is the smallest
-    number above 1 that has no divisor in common with `g` (2 for `width=10`).
+    number above 1 that is coprime to `g` (2 for `width=10`).
 
     ## Rewards
     `position / (width - 1)`, minus `hit_cost` when the new eruption is at the new position.
@@ -84,7 +84,7 @@ class GeyserRunner(Game):
     ```
     - `mode`: `"stochastic"` or `"deterministic"` eruptions.
     - `width`: columns of the field, an even number of at least 4.
-    - `hit_cost`: what a hit costs, any finite number.
+    - `hit_cost`: cost of a hit, any finite number.
     - `stay`: whether the player may stay in place.
 
     ## Other goals (`reward_functions`)
@@ -154,7 +154,7 @@ class GeyserRunner(Game):
 
     def _spray(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
         half = self.width // 2
-        wet = np.zeros((len(next_obs), self.width + 2), dtype=next_obs.dtype)  # a column more at each side
+        wet = np.zeros((len(next_obs), self.width + 2), dtype=next_obs.dtype)  # one more column on each side
         for shift in range(3):
             wet[:, half + shift : self.width + shift] |= next_obs[:, self.width :]
         return as_floats((wet[:, 1:-1] & next_obs[:, : self.width]).any(axis=1))
@@ -173,7 +173,7 @@ class GeyserRunner(Game):
         return outcomes, np.full((len(obs), geysers), 1 / geysers)
 
     def invalid(self, obs: Bits) -> str | None:
-        """Say what makes a row no state of this game; see `Game.invalid`."""
+        """Describe why a row is not a state of this game; see `Game.invalid`."""
         if (obs[:, : self.width].sum(axis=1) != 1).any():
             return f"exactly one of the first {self.width} bits must be 1 (the position)"
         if (obs[:, self.width :].sum(axis=1) != 1).any():

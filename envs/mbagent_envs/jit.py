@@ -1,8 +1,8 @@
-"""Numba's decorator with types: compiled on first use, kept on disk, and free of the interpreter lock.
+"""Typed decorators for numba: functions are compiled on first use, cached on disk, and run without the interpreter lock.
 
-Numba renews what it keeps when the file of a function changes, but not when a compiled function that it calls from another file
-does. Here everything that was kept is renewed when any file with compiled functions of the same package, or of this one, changes.
-Where nothing can be kept, functions are compiled anew in each process, and one warning says so.
+Numba invalidates its cache when the file of a function changes, but not when a compiled function that it calls from another file
+does. Here the cache is invalidated when any file with compiled functions of the same package, or of this one, changes.
+If nothing can be cached, functions are compiled again in each process, and one warning is given.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ _T = TypeVar("_T")
 
 
 def compiled(function: _F) -> _F:
-    """Compile a function of numbers and arrays; its uncompiled form stays at ``function.py_func``."""
-    return _kept(numba.njit(nogil=True)(function), function)
+    """Compile a function of numbers and arrays; the uncompiled function is available as ``function.py_func``."""
+    return _with_cache(numba.njit(nogil=True)(function), function)
 
 
 def vectorised(function: _F) -> _F:
-    """As ``compiled``, for small loops over arrays of floats: they work on several numbers at once.
+    """As ``compiled``, for small loops over arrays of floats, which are vectorised.
 
-    For that, sums may be taken in another order than written, though always in the same one for the same lengths; a product may
-    be added without being rounded first; and nothing is raised when something is divided by zero. Arrays must be known to lie
-    in one piece: those that ``a, b = np.empty((2, n))`` unpacks are not.
+    For this, sums may be computed in another order than written, though always in the same order for the same lengths; products
+    may be added without intermediate rounding; and division by zero raises no error. Arrays must have a contiguous type, which
+    those unpacked by ``a, b = np.empty((2, n))`` do not have.
     """
-    return _kept(numba.njit(nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})(function), function)
+    return _with_cache(numba.njit(nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})(function), function)
 
 
-def _kept(dispatcher: Any, function: _F) -> _F:
-    """The dispatcher, with a place on disk for what it compiles, marked by the sources that it is made from."""
-    if hasattr(dispatcher, "enable_caching"):  # a plain function where NUMBA_DISABLE_JIT is set
+def _with_cache(dispatcher: Any, function: _F) -> _F:
+    """The dispatcher, with a cache on disk that depends on the hash of the sources."""
+    if hasattr(dispatcher, "enable_caching"):  # a plain function if NUMBA_DISABLE_JIT is set
         try:
             dispatcher._cache = _Cache(function)
-        except RuntimeError as error:  # from numba where it finds no folder that can be written to
+        except RuntimeError as error:  # numba found no writable folder
             if "no locator available" not in str(error):
                 raise
             _warn_uncached()
@@ -52,12 +52,12 @@ def _kept(dispatcher: Any, function: _F) -> _F:
 
 
 class _Cache(FunctionCache):
-    """Numba's, but what cannot be read is compiled, and what cannot be written is not kept: neither stops a program."""
+    """Numba's cache, except that failures of reading or writing raise no error: the function is compiled, but not cached."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)  # type: ignore[no-untyped-call]
         kept: Any = self._cache_file
-        if hasattr(kept, "_version"):  # what numba reads first of a file; one with another version counts as empty
+        if hasattr(kept, "_version"):  # numba treats a file with another version as empty
             kept._version = f"{kept._version} {_sources(_top(Path(function.__code__.co_filename)))}"
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -74,14 +74,14 @@ class _Cache(FunctionCache):
 
 
 _UNUSABLE = (OSError, EOFError, pickle.UnpicklingError)
-"""What numba raises where the folder has been removed or write-protected since, the disk is full, or a file is damaged."""
+"""Numba's errors if the folder has been removed or write-protected in the meantime, the disk is full, or a file is damaged."""
 
 
 @cache
 def _warn_uncached() -> None:
-    """Warns, once in a process, that nothing is kept."""
+    """Warns, once per process, that nothing is cached."""
     warnings.warn(
-        "No folder to keep compiled functions in is writable, so each process compiles them anew, which takes a minute or two; "
+        "No folder for compiled functions is writable, so each process compiles them again, which takes a minute or two; "
         "set the environment variable NUMBA_CACHE_DIR to a writable folder.",
         RuntimeWarning,
         stacklevel=2,
@@ -90,7 +90,7 @@ def _warn_uncached() -> None:
 
 @cache
 def _top(path: Path) -> Path:
-    """Folder of the outermost package that a file is in, or of the file."""
+    """Folder of the outermost package that contains a file; the file's own folder if there is none."""
     folder = path.parent
     while (folder.parent / "__init__.py").exists():
         folder = folder.parent
@@ -99,7 +99,7 @@ def _top(path: Path) -> Path:
 
 @cache
 def _sources(folder: Path) -> str:
-    """A hash of all files with compiled functions in a folder, and in this one."""
+    """A hash of all files with compiled functions in a folder, and in this package."""
     digest, files = hashlib.sha256(), {*folder.rglob("*.py"), *Path(__file__).parent.glob("*.py")}
     for text in (path.read_bytes() for path in sorted(files)):
         if b"jit import" in text or b"numba" in text:
@@ -108,12 +108,12 @@ def _sources(folder: Path) -> str:
 
 
 def inlined(function: _F) -> _F:
-    """Compile a function into every compiled function that calls it: for small ones that are called very often."""
+    """Compile a function inline into every compiled function that calls it; for small functions that are called often."""
     return cast("_F", numba.njit(inline="always")(function))
 
 
 def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
-    """Code that makes arrays, or the arrays in a tuple, forget who owns them."""
+    """Code for arrays, or the arrays in a tuple, without a reference to their owners."""
     if isinstance(kind, types.Array):
         view = context.make_array(kind)(context, builder, value)
         null: Any = cgutils.get_null_value
@@ -137,8 +137,8 @@ def _borrow(typing_context: Any, value: Any) -> Any:
 
 
 borrowed: Callable[[_T], _T] = cast("Any", intrinsic(_borrow))
-"""For compiled code: an array, or a tuple of arrays, without counting references to it; the caller must keep it alive.
+"""For compiled code: an array, or a tuple of arrays, without reference counting; the caller must keep it alive.
 
-Numba counts a reference for each array that is handed to a function, with an atomic operation; in a function that is called
-for every imagined state these cost more than the work.
+Numba counts a reference for each array passed to a function, with an atomic operation; in a function that is called
+for every simulated state these take more time than the work itself.
 """

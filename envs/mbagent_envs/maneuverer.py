@@ -1,4 +1,4 @@
-"""Maneuverer: reach the target among walls that are redrawn each time."""
+"""Maneuverer: reach the target among walls; each success leads to a new random layout."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ COLUMN_MOVES = np.array([0, 1, 0, -1], dtype=np.int64)
 
 @compiled
 def _draw_walls(key: np.uint64, density: float, row: int, column: int, walls: Bits) -> None:
-    """Make each cell but the player's a wall with probability ``density``, given that some neighbour is free.
+    """Make each cell except the player's a wall with probability ``density``, given that some neighbour is free.
 
-    Some cell is reachable exactly when a neighbour is free, so drawing whole layouts until one has a
-    reachable cell gives the same distribution; conditioning directly costs the same at every density. Number
-    i of the key decides cell i.
+    Some cell is reachable if and only if a neighbour is free, so the distribution is that of drawing layouts until
+    one has a reachable cell; direct conditioning takes the same time at every density. Number i of the key
+    determines cell i.
     """
     size = walls.shape[0]
     for i in range(size * size):
@@ -36,7 +36,7 @@ def _draw_walls(key: np.uint64, density: float, row: int, column: int, walls: Bi
         r, c = row + ROW_MOVES[move], column + COLUMN_MOVES[move]
         if not (0 <= r < size and 0 <= c < size):
             continue
-        if not found:  # chance that this one is free, given that one of the `left` undecided ones is
+        if not found:  # probability that this one is free, given that one of the `left` undecided ones is
             free = (1.0 - density) / (1.0 - density**left)
             walls[r, c] = uniform_at(key, r * size + c) < 1.0 - free
             found = walls[r, c] == 0
@@ -45,7 +45,7 @@ def _draw_walls(key: np.uint64, density: float, row: int, column: int, walls: Bi
 
 @compiled
 def _reachable(walls: Bits, row: int, column: int, queue: Ints) -> int:
-    """Fill ``queue`` with the cells (row * size + column) that can be reached, nearest first; count them.
+    """Fill ``queue`` with the reachable cells (row * size + column), nearest first; return their number.
 
     The first is the cell itself. ``queue`` is int64 ``[size * size]``.
     """
@@ -119,16 +119,16 @@ def _all_reachable(obs: Bits) -> bool:
 
 
 class Maneuverer(Game):
-    """A player makes his way to a target through walls; there, walls and target are drawn anew around him.
+    """A player moves around walls to a target; when it is reached, walls and target are drawn again at random.
 
     ## Description
-    A square board of `size` x `size` cells with one player, walls and a target that he can always reach. Each
-    time he gets there, a new layout appears around him, so that a layout is hardly ever seen twice: to play
-    well, one must have learned what walls do, not what this maze looks like. After Braylan and Miikkulainen
+    A square board of `size` x `size` cells with one player, walls and a target that the player can always reach.
+    Each time it is reached, a new layout appears around the player, so that layouts are hardly ever repeated: to
+    play well, one must have learned the effect of walls, not a particular maze. After Braylan and Miikkulainen
     (2015), section 5.
 
     ## Action Space
-    `Discrete(4)`. A wall or the edge blocks the way, and the player stays where he is.
+    `Discrete(4)`. If a wall or the edge blocks the move, the player stays in place.
 
     - 0: up
     - 1: right
@@ -140,12 +140,12 @@ class Maneuverer(Game):
     the top.
 
     ## Starting State
-    The player at a uniform cell. Every other cell is a wall with probability `wall_density`; the target is
-    uniform over the other cells that the player can reach. Where there is none, the layout is drawn again.
+    The player at a uniformly random cell. Every other cell is a wall with probability `wall_density`; the target
+    is uniform over the other cells that the player can reach. If there is none, the layout is drawn again.
 
     ## Transition
-    The player moves. From a state in which he stands on the target the next step, whatever the action, moves
-    nothing and draws walls and target anew around him, like the start.
+    The player moves. If he stands on the target, the next step instead, for any action, leaves him in place and
+    draws walls and target again as for a starting state.
 
     ## Rewards
     1 when the next observation has the player on the target, else 0.
@@ -162,7 +162,7 @@ class Maneuverer(Game):
 
     ## Other goals (`reward_functions`)
     - `"corner"`: 1 for standing in the top left cell.
-    - `"next to target"`: 1 for standing beside the target (up, right, down or left of it), not on it.
+    - `"next to target"`: 1 for standing directly above, right of, below or left of the target, not on it.
     - `"keep moving"`: 1 for every step that moves the player.
     - `"nook"`: 1 for standing where at least two of the four sides are blocked by a wall or the edge.
 
@@ -175,7 +175,7 @@ class Maneuverer(Game):
     def __init__(self, *, size: int = 6, wall_density: float = 0.2) -> None:
         """See the class."""
         self.size = check_integer("size", size, 2)
-        self.wall_density = check_number("wall_density", wall_density, 0.0, 1.0, below=True)  # 1: no cell could be reached
+        self.wall_density = check_number("wall_density", wall_density, 0.0, 1.0, below=True)  # with 1, no cell could be reached
         goals = {
             "corner": self._corner,
             "next to target": self._next_to,
@@ -208,8 +208,8 @@ class Maneuverer(Game):
         return as_floats(next_obs[:, 0, 0, 0])
 
     def _next_to(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
-        beside = _sides(next_obs[:, 2], edge=0).any(axis=0)
-        return as_floats((next_obs[:, 0] & beside).any(axis=(1, 2)))
+        adjacent = _sides(next_obs[:, 2], edge=0).any(axis=0)
+        return as_floats((next_obs[:, 0] & adjacent).any(axis=(1, 2)))
 
     def _moving(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
         return as_floats((obs[:, 0] != next_obs[:, 0]).any(axis=(1, 2)))
@@ -222,8 +222,7 @@ class Maneuverer(Game):
         """Return the one successor of a move; see `Game.transition_distribution`.
 
         Raises:
-            NotImplementedError: for a state with the player on the target, from which every layout may
-                follow.
+            NotImplementedError: for a state with the player on the target, which any layout may follow.
         """
         if (obs[0] & obs[2]).any():
             raise NotImplementedError(
@@ -233,7 +232,7 @@ class Maneuverer(Game):
         return self.transition(obs[None], np.array([action]), np.zeros(1, dtype=np.uint64)), np.ones(1)
 
     def invalid(self, obs: Bits) -> str | None:
-        """Say what makes a row no state of this game; see `Game.invalid`."""
+        """Describe why a row is not a state of this game; see `Game.invalid`."""
         for plane, name in ((0, "player"), (2, "target")):
             if (obs[:, plane].sum(axis=(1, 2)) != 1).any():
                 return f"plane {plane} must hold exactly one 1 (the {name})"
@@ -242,7 +241,7 @@ class Maneuverer(Game):
         return None if _all_reachable(obs) else "the player must be able to reach the target"
 
     def scene(self, obs: Bits) -> Scene:
-        """Return the board, one cell each."""
+        """Return the board with one sprite per object."""
         player = "player scoring" if (obs[0] & obs[2]).any() else "player"
         things = [
             Sprite(kind, int(row), int(column))
@@ -253,6 +252,6 @@ class Maneuverer(Game):
 
 
 def _sides(plane: npt.NDArray[Any], edge: int) -> npt.NDArray[Any]:
-    """Return what lies above, right of, below and left of each cell: ``[B, h, w]`` -> ``[4, B, h, w]``."""
+    """Return the values above, right of, below and left of each cell: ``[B, h, w]`` -> ``[4, B, h, w]``."""
     padded = np.pad(plane, ((0, 0), (1, 1), (1, 1)), constant_values=edge)
     return np.stack([padded[:, :-2, 1:-1], padded[:, 1:-1, 2:], padded[:, 2:, 1:-1], padded[:, 1:-1, :-2]])

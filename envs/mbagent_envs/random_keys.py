@@ -1,9 +1,9 @@
-"""Random numbers from keys: every row of a batch draws its own, whatever stands beside it.
+"""Counter-based random numbers: every row of a batch has its own key, independent of the other rows.
 
-A key is a 64-bit unsigned integer. The numbers that belong to it are a pure function of (key, index): they
-depend neither on the other rows of a batch nor on what was drawn before, so a simulation gives the same
-outcome alone, in a batch, on another thread, or replayed later. Mixing is the finaliser of splitmix64
-(Steele, Lea and Flood 2014, "Fast splittable pseudorandom number generators"), used counter-based.
+A key is a 64-bit unsigned integer. Its random numbers are a pure function of (key, index): they depend neither on the
+other rows of a batch nor on earlier draws, so a simulation gives the same outcome alone, in a batch, on another
+thread, or repeated later. The mixing function is the finaliser of splitmix64 (Steele, Lea and Flood 2014, "Fast
+splittable pseudorandom number generators"), applied to a counter.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mbagent_envs.jit import compiled
 from mbagent_envs.types import Keys
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)  # step of splitmix64: 2**64 / golden ratio, odd
-_SALT_GAMMA = np.uint64(0xD1342543DE82EF95)  # another odd step, so that derived keys never repeat the stream of their parent
+_SALT_GAMMA = np.uint64(0xD1342543DE82EF95)  # another odd step, so that derived keys do not repeat their parent's stream
 _M1 = np.uint64(0xBF58476D1CE4E5B9)
 _M2 = np.uint64(0x94D049BB133111EB)
 _ONE = np.uint64(1)
@@ -48,14 +48,14 @@ def derive_one(key: np.uint64, salt: np.uint64) -> np.uint64:
 
 @compiled
 def _derive_rows(keys: Keys, salts: Keys, out: Keys) -> None:
-    key_step, salt_step = min(keys.shape[0] - 1, 1), min(salts.shape[0] - 1, 1)  # 0 where one serves all rows
+    key_step, salt_step = min(keys.shape[0] - 1, 1), min(salts.shape[0] - 1, 1)  # 0 if one is used for all rows
     for row in range(out.shape[0]):
         out[row] = derive_one(keys[row * key_step], salts[row * salt_step])
 
 
 @compiled
 def fill_row(key: np.uint64, out: npt.NDArray[np.float64]) -> None:
-    """Writes the first numbers of ``key`` to ``out``, several at once; for compiled code."""
+    """Write the first numbers of ``key`` to ``out``, vectorised; for compiled code."""
     start = mix(key)
     for index in range(out.shape[0]):
         word = mix(start + (np.uint64(index) + _ONE) * _GAMMA)
@@ -69,7 +69,7 @@ def _fill_uniforms(keys: Keys, out: npt.NDArray[np.float64]) -> None:
 
 
 def as_keys(keys: npt.ArrayLike) -> Keys:
-    """Return ``keys`` as a uint64 array of at least one axis; negative integers wrap round.
+    """Return ``keys`` as a uint64 array of at least one axis; negative integers wrap around.
 
     Raises:
         TypeError: if ``keys`` are not integers.
@@ -85,10 +85,10 @@ def uniforms(keys: npt.ArrayLike, n: int) -> npt.NDArray[np.float64]:
 
     Args:
         keys: uint64 ``[B]``.
-        n: how many numbers a key.
+        n: numbers per key.
 
     Returns:
-        float64 ``[B, n]`` in [0, 1); row ``b`` depends on ``keys[b]`` only, and a larger ``n`` only appends
+        float64 ``[B, n]`` in [0, 1); row ``b`` depends only on ``keys[b]``, and a larger ``n`` only appends
         columns.
     """
     rows = np.ascontiguousarray(as_keys(keys))
@@ -102,14 +102,14 @@ def derive(keys: npt.ArrayLike, *salt: npt.ArrayLike) -> Keys:
 
     Args:
         keys: uint64 ``[B]``, or one integer.
-        *salt: integers, or arrays ``[B]`` of them, that name the purpose (a step number, an action); their
+        *salt: integers, or arrays ``[B]`` of them, that identify the purpose (a step number, an action); their
             order matters.
 
     Returns:
-        uint64 ``[B]`` (``[1]`` when everything given is a single integer).
+        uint64 ``[B]`` (``[1]`` if all arguments are single integers).
 
     Raises:
-        TypeError: if anything given is not integers.
+        TypeError: if an argument is not an integer or an array of integers.
         ValueError: if lengths above 1 differ.
     """
     result = as_keys(keys)
@@ -125,7 +125,7 @@ def derive(keys: npt.ArrayLike, *salt: npt.ArrayLike) -> Keys:
 
 
 def draw_keys(rng: np.random.Generator, n: int) -> Keys:
-    """Draw ``n`` fresh keys, uint64 ``[n]``, from a generator."""
+    """Draw ``n`` new keys, uint64 ``[n]``, from a generator."""
     return rng.integers(0, 2**64, size=n, dtype=np.uint64)
 
 

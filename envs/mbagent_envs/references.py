@@ -1,8 +1,8 @@
-"""Reference policies: how well each game can be played by one who knows its rules.
+"""Reference policies, which plan with the true rules of each game.
 
-GeyserRunner is solved exactly. In Maneuverer and FlierCatcher the near future is known (a layout stays until
-the target is reached; the fliers in view fly on), so dynamic programming over it plans well for any goal,
-though it is not proved optimal. All of them work for any reward function of the right form, not just the
+GeyserRunner is solved exactly. In Maneuverer and FlierCatcher the near future is deterministic (a layout is constant
+until the target is reached; visible fliers move on), so dynamic programming over it plans well for any goal,
+without being provably optimal. The policies work for any reward function of the right form, not only the
 named goals.
 """
 
@@ -23,7 +23,7 @@ from mbagent_envs.types import Bits, Floats, Ints
 ReferencePolicy = Callable[[Bits], Ints]
 """Observations int8 ``[B, *shape]`` -> actions int64 ``[B]``."""
 
-_TIE = 1e-7  # values closer than this share of their size are equal: rounding must not decide
+_TIE = 1e-7  # relative difference below which values count as equal, so that rounding has no effect
 
 
 def reference_policy(game: Game, reward: str | RewardFn = "default", gamma: float = 0.99) -> ReferencePolicy | None:
@@ -35,9 +35,9 @@ def reference_policy(game: Game, reward: str | RewardFn = "default", gamma: floa
         gamma: discount of the plan, in [0, 1).
 
     Returns:
-        For GeyserRunner the optimum of the discounted infinite horizon (value iteration over all states); for
-        Maneuverer the shortest way to what the goal rewards within the layout, with the average layout's
-        value behind the target; for FlierCatcher the best path among the fliers in view.
+        For GeyserRunner the optimal policy for the discounted infinite horizon (value iteration over all states); for
+        Maneuverer the optimal path within the layout, with the average value of new layouts after the target; for
+        FlierCatcher the best path among the visible fliers.
 
     Raises:
         ValueError: if there is no goal of that name, or ``gamma`` is outside [0, 1).
@@ -58,7 +58,7 @@ def reference_policy(game: Game, reward: str | RewardFn = "default", gamma: floa
 
 
 def _best(values: Floats) -> Ints:
-    """Return the first best action of ``values`` ``[B, A]``; differences by rounding do not count."""
+    """Return the first best action of ``values`` ``[B, A]``, ignoring rounding errors."""
     best = values.max(axis=1, keepdims=True)
     good = values >= best - _TIE * (1 + np.abs(best))
     chosen: Ints = np.argmax(good, axis=1)
@@ -66,7 +66,7 @@ def _best(values: Floats) -> Ints:
 
 
 def geyser_states(game: GeyserRunner) -> Bits:
-    """Return every state, int8 ``[width * g, width + g]``: position major, eruption minor."""
+    """Return all states, int8 ``[width * g, width + g]``, in position-major order."""
     geysers = game.width // 2
     position = np.repeat(np.eye(game.width, dtype=np.int8), geysers, axis=0)
     eruption = np.tile(np.eye(geysers, dtype=np.int8), (game.width, 1))
@@ -88,7 +88,7 @@ def geyser_values(game: GeyserRunner, reward: RewardFn, gamma: float) -> Floats:
             listed, probabilities = game.transition_distribution(state, action)
             following.append(listed)
             chance.append(probabilities)
-    shape = (len(states), n_actions, len(chance[0]))  # as many successors everywhere
+    shape = (len(states), n_actions, len(chance[0]))  # all states have the same number of successors
     weights, next_obs = np.reshape(chance, shape), np.concatenate(following)
     next_state = _geyser_index(game, next_obs).reshape(shape)
     obs = np.repeat(states, n_actions * shape[2], axis=0)
@@ -109,7 +109,7 @@ def _geyser_runner(game: GeyserRunner, reward: RewardFn, gamma: float) -> Refere
 
 
 class _LayoutPlanner:
-    """Maneuverer by value iteration within the layout, where all is certain until the target is reached.
+    """Maneuverer by value iteration within the layout, which is deterministic until the target is reached.
 
     Args:
         game: the game.
@@ -120,14 +120,14 @@ class _LayoutPlanner:
     def __init__(self, game: Maneuverer, reward: RewardFn, gamma: float) -> None:
         self._game, self._reward, self._gamma = game, reward, gamma
         cells = game.size**2
-        self._chunk = 1 + 2_000_000 // cells**2  # layouts looked at together: bounds the memory
+        self._chunk = 1 + 2_000_000 // cells**2  # number of layouts processed together, which bounds the memory
         self._plans: dict[bytes, Ints] = {}  # walls and target -> action for each cell
         self._redrawn = self._value_of_redrawing(max(4, 600 // cells))
 
     def _value_of_redrawing(self, samples: int) -> Floats:
-        """Return what it is worth to have reached the target at each cell, ``[cells]``.
+        """Return the value of having reached the target at each cell, ``[cells]``.
 
-        That is the mean over ``samples`` layouts drawn around the cell, whose own values count on it again.
+        This is the mean over ``samples`` layouts drawn around the cell, whose values in turn depend on it.
         """
         game, gamma, cells = self._game, self._gamma, self._game.size**2
         around = np.zeros((cells * samples, *game.observation_space.shape), dtype=np.int8)
@@ -179,7 +179,7 @@ class _LayoutPlanner:
         return next_cell, earned, obs[:, 2].reshape(batch, cells).argmax(axis=1)
 
     def _step(self, obs: Bits) -> tuple[Ints, Floats]:
-        """Try every action from every cell of a few layouts."""
+        """Compute the result of every action from every cell of a few layouts."""
         batch, size, n_actions = len(obs), self._game.size, len(self._game.action_names)
         cells = size**2
         states = np.repeat(obs[:, None], cells, axis=1)
@@ -187,7 +187,7 @@ class _LayoutPlanner:
         before = np.repeat(states.reshape(-1, *obs.shape[1:]), n_actions, axis=0)
         actions = np.tile(np.arange(n_actions), batch * cells)
         held = before.copy()
-        held[:, 2] = 0  # without a target nothing is redrawn
+        held[:, 2] = 0  # without a target no layout is drawn
         after = self._game.transition(held, actions, np.zeros(len(held), dtype=np.uint64))
         after[:, 2] = before[:, 2]
         next_cell = np.argmax(after[:, 0].reshape(batch, cells, n_actions, cells), axis=3)
@@ -204,7 +204,7 @@ def _solve(
     tolerance: float,
     values: Floats,
 ) -> None:
-    """Improve the state values ``[B, cells]`` in place until they are optimal, the targets' being fixed."""
+    """Iterate the state values ``[B, cells]`` in place until they are optimal, with fixed values at the targets."""
     batch, cells, n_actions = earned.shape
     for b in range(batch):
         for _ in range(100_000):
@@ -224,17 +224,17 @@ def _solve(
 
 
 class _FlierPlanner:
-    """FlierCatcher by dynamic programming over the fliers in view, then the average value of a row.
+    """FlierCatcher by dynamic programming over the visible fliers, followed by the average value of a row.
 
     Args:
         game: the game.
         reward: the goal.
         gamma: discount.
-        samples: boards drawn to find the average value of each row.
+        samples: number of boards over which the value of each row is averaged.
     """
 
     def __init__(self, game: FlierCatcher, reward: RewardFn, gamma: float, samples: int = 256) -> None:
-        # The same game without new fliers: what is in view moves on.
+        # The same game without new fliers: visible fliers move on.
         self._quiet = FlierCatcher(height=game.height, width=game.width, spawn_rate=0.0, stay=game.stay)
         self._reward, self._gamma = reward, gamma
         self._beyond = np.zeros(game.height)
@@ -242,7 +242,7 @@ class _FlierPlanner:
         boards = game.initial(keys)
         for step in range(game.width):
             boards = game.transition(boards, np.zeros(samples, dtype=np.int64), derive(keys, step + 1))
-        for _ in range(5):  # only differences between rows matter, and they settle at once
+        for _ in range(5):  # only differences between rows matter, and these converge quickly
             values = self._values(boards).max(axis=2).mean(axis=0)
             self._beyond = values - values.mean()
 
@@ -252,7 +252,7 @@ class _FlierPlanner:
         return _best(self._values(obs)[np.arange(len(obs)), rows])
 
     def _values(self, obs: Bits) -> Floats:
-        """Return the action values of every row the player might be in, float64 ``[B, height, actions]``."""
+        """Return the action values for each possible row of the player, float64 ``[B, height, actions]``."""
         game = self._quiet
         height, n_actions = game.height, len(game.action_names)
         states = np.repeat(obs[:, None], height, axis=1)

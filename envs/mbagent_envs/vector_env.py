@@ -1,4 +1,4 @@
-"""One Gymnasium vector environment for every game: all copies take their step in one call."""
+"""One Gymnasium vector environment for every game: all copies are stepped in one call."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ class GameVectorEnv(gym.vector.VectorEnv[Bits, npt.NDArray[Any], npt.NDArray[Any
     """Many copies of one game, stepped together; build it with `gymnasium.make_vec`.
 
     Copy ``i`` follows the same trajectory as a single environment with seed ``seed + i``, so this class can
-    stand in for `gymnasium.vector.SyncVectorEnv` whatever the autoreset mode.
+    replace `gymnasium.vector.SyncVectorEnv` in every autoreset mode.
 
     Args:
         game: a game's name, ``"module:Class"``, class or instance.
         num_envs: number of copies.
-        max_episode_steps: steps until truncation; None for the game's own number, -1 for none.
+        max_episode_steps: steps until truncation; None for the game's own limit, -1 for no limit.
         render_mode: ``"rgb_array"``, ``"ansi"``, or None; `render` returns one picture for each copy.
-        autoreset_mode: when a finished copy starts anew: ``"NextStep"`` (the following call of `step` resets
-            it and ignores its action), ``"SameStep"`` (at once; the last observation stands in
-            ``infos["final_obs"]``) or ``"Disabled"`` (call `reset` with ``options={"reset_mask": mask}``).
+        autoreset_mode: when a finished copy is reset: ``"NextStep"`` (the following call of `step` resets it and
+            ignores its action), ``"SameStep"`` (immediately; the last observation is in ``infos["final_obs"]``)
+            or ``"Disabled"`` (call `reset` with ``options={"reset_mask": mask}``).
         **arguments: the game's own.
 
     Raises:
         TypeError: for an unknown argument or one of the wrong type.
-        ValueError: for an impossible value.
+        ValueError: for an invalid value.
     """
 
     metadata: dict[str, Any] = {**GameEnv.metadata, "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
@@ -74,13 +74,13 @@ class GameVectorEnv(gym.vector.VectorEnv[Bits, npt.NDArray[Any], npt.NDArray[Any
 
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
-        """The copies' generators, as in `gymnasium.vector.SyncVectorEnv`; made at first use if unseeded."""
+        """The copies' generators, as in `gymnasium.vector.SyncVectorEnv`; created at first use if unseeded."""
         return tuple(self._generator(i) for i in range(self.num_envs))
 
     @property
     def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
         """The copies' seeds."""
-        self.np_random  # noqa: B018 -- makes the generators that are missing
+        self.np_random  # noqa: B018 -- creates missing generators
         return tuple(self._seeds)
 
     def _generator(self, i: int) -> np.random.Generator:
@@ -96,14 +96,13 @@ class GameVectorEnv(gym.vector.VectorEnv[Bits, npt.NDArray[Any], npt.NDArray[Any
         """Start an episode in every copy.
 
         Args:
-            seed: copy ``i`` is seeded with ``seed + i``, or with ``seed[i]``; None goes on with its
-                generator.
+            seed: copy ``i`` is seeded with ``seed + i``, or with ``seed[i]``; None continues its generator's
+                sequence.
             options: ``{"state": obs}`` starts from this observation (one for all, or one for each) instead of
-                a drawn one; ``{"reset_mask": bool [num_envs]}`` resets only some copies.
+                a random one; ``{"reset_mask": bool [num_envs]}`` resets only some copies.
 
         Raises:
-            ValueError: for an unknown option, a state that is none of this game, or a wrong number of seeds
-                or states.
+            ValueError: for an unknown option, an invalid state, or a wrong number of seeds or states.
         """
         given = check_options(options, ("state", "reset_mask"))
         mask = self._reset_mask(given.get("reset_mask"))
@@ -173,7 +172,7 @@ class GameVectorEnv(gym.vector.VectorEnv[Bits, npt.NDArray[Any], npt.NDArray[Any
         if self._obs is None:
             raise gym.error.ResetNeeded("Cannot call envs.step() before calling envs.reset()")
         checked = self.game.check_actions(actions, self.num_envs)
-        stale = self._done.copy()  # finished in the step before
+        stale = self._done.copy()  # finished in the previous step
         if self.autoreset_mode is AutoresetMode.DISABLED and stale.any():
             raise gym.error.ResetNeeded(
                 f"copies {np.flatnonzero(stale).tolist()} have ended; reset them with options={{'reset_mask': mask}} first."
@@ -194,7 +193,7 @@ class GameVectorEnv(gym.vector.VectorEnv[Bits, npt.NDArray[Any], npt.NDArray[Any
         return self._obs.copy(), rewards, terminations, truncations, infos
 
     def _reset_finished(self) -> dict[str, Any]:
-        """Start anew the copies that have just ended; return the infos that keep their last observations."""
+        """Reset the copies that have just finished; return the infos with their last observations."""
         assert self._obs is not None
         finished = self._done.copy()
         final_obs = np.full(self.num_envs, None, dtype=object)

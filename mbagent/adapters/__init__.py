@@ -1,1 +1,1 @@
-"""Environments of other packages in a form that the agent takes. Each module needs the extra that it names."""
+"""Environments of other packages in a form that the agent supports. Each module requires the extra that it names."""

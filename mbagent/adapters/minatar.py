@@ -19,12 +19,12 @@ from mbagent.wrappers import History
 
 
 class MinAtarEnv(gym.Env[NDArray[np.int8], np.int64], gym.utils.EzPickle):
-    """A MinAtar game: bits [channels, 10, 10], and those actions that do anything in it.
+    """A MinAtar game: bits [channels, 10, 10], and the actions that have an effect in this game.
 
     Args:
         game: "asterix", "breakout", "freeway", "seaquest" or "space_invaders".
-        sticky: probability that the last action is taken once more, whatever is chosen.
-        ramping: whether it becomes more difficult with time.
+        sticky: probability that the previous action is repeated instead of the chosen one.
+        ramping: whether the game becomes more difficult over time.
 
     Raises:
         DependencyNotInstalled: minatar is missing.
@@ -66,14 +66,14 @@ class MinAtarEnv(gym.Env[NDArray[np.int8], np.int64], gym.utils.EzPickle):
 
 
 def make_minatar(game: str, *, k: int = 1, max_episode_steps: int = 1000, **kwargs: Any) -> gym.Env[Any, Any]:
-    """A MinAtar game whose observation shows the last ``k`` frames and actions, too; see History.
+    """A MinAtar game whose observation includes the last ``k`` frames and actions; see History.
 
-    Sticky actions and things that move only at some frames hang on these.
+    Sticky actions and objects that move only in some frames depend on them.
 
     Args:
         game: see MinAtarEnv.
-        k: steps back; 0 for the frame alone.
-        max_episode_steps: steps after which an episode is cut off; who plays well would play for ever.
+        k: number of previous frames; 0 for the current frame only.
+        max_episode_steps: steps after which an episode is truncated; a good player might never lose.
         **kwargs: for MinAtarEnv.
     """
     env: gym.Env[Any, Any] = TimeLimit(MinAtarEnv(game, **kwargs), max_episode_steps)

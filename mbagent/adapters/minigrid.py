@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 
 class WholeGrid(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArgs):
-    """A MiniGrid world whose observation is the whole grid, and what the agent carries.
+    """A MiniGrid world whose observation is the whole grid and, optionally, the carried object.
 
-    Planes [width, height, 3]: kind of object, colour, and state (of a door, or the direction of the agent), as
-    ``minigrid.wrappers.FullyObsWrapper`` shows them, without the mission's text. What is carried is not on the grid, so
+    Planes [width, height, 3]: kind of object, colour, and state (of a door, or the direction of the agent), as in
+    ``minigrid.wrappers.FullyObsWrapper``, without the mission's text. A carried object is not on the grid, so
     with ``carried`` it is shown in the lower right corner, which is always a wall.
 
     Args:
         env: a MiniGrid environment.
-        carried: whether to show what the agent carries; for worlds with things to pick up.
+        carried: whether to show the object that the agent carries; for worlds with objects to pick up.
     """
 
     def __init__(self, env: gym.Env[Any, Any], carried: bool = False) -> None:
@@ -41,7 +41,7 @@ class WholeGrid(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstruct
 
     def observation(self, observation: Any) -> NDArray[np.uint8]:
         """The grid, uint8 [width, height, 3]."""
-        del observation  # what the agent sees from where it stands
+        del observation  # the partial view of the agent
         image: NDArray[np.uint8] = self.world.grid.encode()
         image[tuple(self.world.agent_pos)] = *self._agent, self.world.agent_dir
         if self.carried and self.world.carrying is not None:
@@ -53,7 +53,7 @@ def make_minigrid(env_id: str, *, carried: bool = False, **kwargs: Any) -> gym.E
     """A MiniGrid world, fully observed.
 
     Args:
-        env_id: its name ("MiniGrid-Empty-5x5-v0").
+        env_id: name of the environment ("MiniGrid-Empty-5x5-v0").
         carried: see WholeGrid.
         **kwargs: for ``gym.make``.
 
@@ -67,7 +67,7 @@ def make_minigrid(env_id: str, *, carried: bool = False, **kwargs: Any) -> gym.E
 
 
 def minigrid_factory(env_id: str, *, carried: bool = False, **kwargs: Any) -> Callable[[], gym.Env[Any, Any]]:
-    """A function without arguments that makes copies; it can be pickled, as SubprocVecEnv asks. See ``make_minigrid``."""
+    """A picklable function without arguments that creates environments, for SubprocVecEnv. See ``make_minigrid``."""
     return partial(make_minigrid, env_id, carried=carried, **kwargs)
 
 

@@ -24,23 +24,23 @@ from numpy.typing import NDArray
 from mbagent.spaces import MAX_ACTIONS
 
 Assignment = dict[str, Any]
-"""Values of action fluents that differ from their defaults, by name; {} does nothing."""
+"""Values of action fluents that differ from their defaults, by name; {} is the no-op."""
 
 
 class RddlEnv(gym.Env[NDArray[np.integer[Any]], np.int64], gym.utils.EzPickle):
-    """An RDDL domain and instance, with one Discrete action and its fluents as a row of variables.
+    """An RDDL domain and instance, with one Discrete action and the fluents as a vector of variables.
 
-    Observations are ``MultiBinary``, one bit for each state fluent (observation fluent, in a POMDP), or ``MultiDiscrete`` where
-    some have more than two values. Every joint action is a number: 0 does nothing, then come those in which one action fluent has
-    not its default, then two and so on, up to the instance's max-nondef-actions. An instance's horizon truncates an episode.
-    Copies can be pickled; each has random numbers of its own.
+    Observations are ``MultiBinary``, one bit for each state fluent (observation fluent, in a POMDP), or ``MultiDiscrete`` if
+    some have more than two values. Joint actions are numbered: 0 is the no-op, followed by those in which one action fluent
+    differs from its default, then two and so on, up to the instance's max-nondef-actions. Episodes are truncated at the
+    instance's horizon. Copies can be pickled; each has its own random numbers.
 
     Args:
         domain: a name in rddlrepository ("SysAdmin_MDP_ippc2011"), or the path of a domain.rddl.
-        instance: an instance of it (1), or the path of an instance.rddl.
+        instance: one of its instances (1), or the path of an instance.rddl.
 
     Attributes:
-        assignments: what each action stands for.
+        assignments: the fluent values of each action.
         fluents: name of each variable of an observation.
 
     Raises:
@@ -63,7 +63,7 @@ class RddlEnv(gym.Env[NDArray[np.integer[Any]], np.int64], gym.utils.EzPickle):
         self.observation_space = spaces.MultiBinary(len(sizes)) if (sizes == 2).all() else spaces.MultiDiscrete(sizes)
         self.assignments = _joint_actions(self.rddl)
         self.action_space = spaces.Discrete(len(self.assignments))
-        self.rddl.seed(int(np.random.SeedSequence().generate_state(1)[0]))  # else all unseeded copies would share one generator
+        self.rddl.seed(int(np.random.SeedSequence().generate_state(1)[0]))  # unseeded copies would share one generator
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -85,25 +85,25 @@ class RddlEnv(gym.Env[NDArray[np.integer[Any]], np.int64], gym.utils.EzPickle):
         self.rddl.close()
 
     def _observed(self, fluents: Mapping[str, Any]) -> NDArray[np.integer[Any]]:
-        values = [self._number(fluents[name]) for name in self.fluents]  # in a POMDP there is no observation at first
+        values = [self._number(fluents[name]) for name in self.fluents]  # in a POMDP there is no observation after reset
         numbers = np.maximum(np.array(values, dtype=np.int64) - self._lows, 0)
         observed: NDArray[np.integer[Any]] = numbers.astype(self.observation_space.dtype)
         return observed
 
     def _number(self, value: Any) -> int:
-        """A fluent's value; an object's number among those of its type; the default where there is none."""
+        """A fluent's value as an integer: an object's number within its type; 0 if there is no value."""
         if value is None:
             return 0
         return int(self.rddl.model.object_to_index[value]) if isinstance(value, str) else int(value)
 
 
 def rddl_factory(domain: str, instance: str | int = 1) -> Callable[[], RddlEnv]:
-    """A function without arguments that makes copies; it can be pickled, as SubprocVecEnv asks. See RddlEnv."""
+    """A picklable function without arguments that creates environments, for SubprocVecEnv. See RddlEnv."""
     return partial(RddlEnv, domain, instance)
 
 
 def load_rddl(domain: str, instance: str | int, **kwargs: Any) -> Any:
-    """A pyRDDLGym environment; see RddlEnv for the arguments and errors, ``pyRDDLGym.RDDLEnv`` for others."""
+    """A pyRDDLGym environment; see RddlEnv for the arguments and errors, ``pyRDDLGym.RDDLEnv`` for further arguments."""
     missing = [name for name in ("pyRDDLGym", "rddlrepository") if importlib.util.find_spec(name) is None]
     if missing:
         raise DependencyNotInstalled(f'RDDL domains need {" and ".join(missing)}: pip install "mbagent[rddl]".')
@@ -112,7 +112,7 @@ def load_rddl(domain: str, instance: str | int, **kwargs: Any) -> Any:
     from rddlrepository.core.error import RDDLRepoDomainNotExistError, RDDLRepoInstanceNotExistError  # noqa: PLC0415
 
     try:
-        with redirect_stderr(io.StringIO()):  # the parser generator tells of its tables
+        with redirect_stderr(io.StringIO()):  # the parser generator reports about its tables
             return pyRDDLGym.make(domain, str(instance), **kwargs)
     except RDDLRepoDomainNotExistError as error:
         some = ", ".join(sorted(RDDLRepoManager().list_problems())[:5])
@@ -124,14 +124,14 @@ def load_rddl(domain: str, instance: str | int, **kwargs: Any) -> Any:
 
 
 def _values_of(space: spaces.Space[Any], name: str) -> tuple[int, int]:
-    """Lowest value, and how many there are."""
+    """Lowest value and number of values."""
     if not isinstance(space, spaces.Discrete):
         raise TypeError(f"The fluent {name!r} is continuous ({space}), and only discrete ones can be modelled.")
     return int(space.start), int(space.n)
 
 
 def _joint_actions(env: Any) -> tuple[Assignment, ...]:
-    """All joint actions with as many fluents off their defaults as are allowed, the fewest first."""
+    """All joint actions with at most the allowed number of non-default fluents, ordered by that number."""
     defaults: dict[str, Any] = env._noop_actions  # pyRDDLGym has no public name for them
     choices: dict[str, list[Any]] = {}
     for name, part in env.action_space.spaces.items():
@@ -150,8 +150,8 @@ def _joint_actions(env: Any) -> tuple[Assignment, ...]:
 
 
 def _refuse_too_many(sizes: list[int], most: int) -> None:
-    """Raises ValueError where there are too many joint actions, counted without listing them."""
-    counts = [1] + [0] * most  # by the number of fluents off their defaults
+    """Raises ValueError if there are too many joint actions, which are counted without listing them."""
+    counts = [1] + [0] * most  # by the number of non-default fluents
     for size in sizes:
         counts = [n + size * (counts[k - 1] if k else 0) for k, n in enumerate(counts)]
     if sum(counts) > MAX_ACTIONS:

@@ -1,4 +1,4 @@
-"""The questions SB3 asks of an algorithm, and those that only a reward-free model learner must answer."""
+"""Tests of the agent: the behaviour that SB3 expects of an algorithm, and reward-free model learning."""
 
 from collections.abc import Callable
 from typing import Any
@@ -117,16 +117,16 @@ def test_no_reset_is_learned_as_a_transition() -> None:
         assert part.states[0, 0] == 0
 
 
-def test_reward_and_termination_are_learned_where_they_are_not_given() -> None:
+def test_reward_and_termination_are_learned_without_a_reward_function() -> None:
     with pytest.warns(UserWarning, match="no reward_fn"):
         agent = corridor_agent().learn(3000, log_interval=None)
     assert agent.goals.source == "learned"
     assert [int(agent.predict(np.array(s))[0]) for s in range(4)] == [1, 1, 1, 1]
     plan = agent.policy.plan(np.array([[3]]))
-    assert plan.values[0, 1] == pytest.approx(1.0, abs=0.02)  # nothing is earned after termination
+    assert plan.values[0, 1] == pytest.approx(1.0, abs=0.02)  # no rewards after termination
 
 
-def test_rewards_are_learned_as_the_environment_gave_them_whatever_a_wrapper_makes_of_them() -> None:
+def test_rewards_are_learned_as_the_environment_gave_them_despite_wrappers() -> None:
     env = VecNormalize(DummyVecEnv([Corridor]), norm_obs=False, norm_reward=True)
     with pytest.warns(UserWarning, match="no reward_fn"):
         agent = ModelLearningAgent("MctsPolicy", env, seed=0).learn(2000, log_interval=None)
@@ -134,7 +134,7 @@ def test_rewards_are_learned_as_the_environment_gave_them_whatever_a_wrapper_mak
     assert int(agent.predict(np.array(3))[0]) == 1
 
 
-def test_learning_goes_on_where_it_stopped() -> None:
+def test_learning_continues_from_the_last_call() -> None:
     agent = corridor_agent(reward=lambda obs, action, next_obs: (next_obs == 4).astype(float)).learn(400, log_interval=None)
     agent.learn(300, log_interval=None, reset_num_timesteps=False)
     assert agent.num_timesteps == 700
@@ -171,7 +171,7 @@ def test_callbacks_that_predict_and_save_work_before_the_first_fit(tmp_path: Any
     assert len(list(tmp_path.glob("*.zip"))) == 2
 
 
-def test_the_log_holds_what_the_documentation_names(runner: ModelLearningAgent) -> None:
+def test_the_log_contains_the_documented_figures(runner: ModelLearningAgent) -> None:
     from stable_baselines3.common.logger import KVWriter, Logger  # noqa: PLC0415 - only this test needs it
 
     class Memory(KVWriter):
@@ -255,7 +255,7 @@ def test_an_observation_outside_the_space_is_refused(runner: ModelLearningAgent,
         runner.predict(obs)
 
 
-def test_version_and_games_are_there() -> None:
+def test_version_and_games_are_available() -> None:
     assert mbagent.__version__
     assert GEYSER in gym.registry
 

@@ -1,4 +1,4 @@
-"""Bad input to the agent gets one sentence that names mistake and fix, and changes nothing."""
+"""Invalid arguments raise an error of one sentence that names the mistake and the fix, and change nothing."""
 
 import io
 import json
@@ -26,14 +26,14 @@ def runner() -> ModelLearningAgent:
 
 
 @pytest.mark.parametrize("steps", [-5, 2.5, float("nan"), True, "x", None])
-def test_a_number_of_steps_that_is_none_is_refused(runner: ModelLearningAgent, steps: Any) -> None:
+def test_invalid_numbers_of_steps_are_refused(runner: ModelLearningAgent, steps: Any) -> None:
     before = len(runner.transitions)
     with pytest.raises(ValueError, match="total_timesteps must be a whole number"):
         runner.learn(steps)
     assert len(runner.transitions) == before
 
 
-def test_steps_written_as_a_float_are_steps_and_zero_fits_what_was_met() -> None:
+def test_steps_may_be_whole_floats_and_zero_fits_earlier_transitions() -> None:
     agent = ModelLearningAgent("MctsPolicy", gym.make(GEYSER), seed=0, model="tabular").learn(2e2, log_interval=None)  # type: ignore[arg-type]
     assert agent.num_timesteps == 200
     agent.learn(0, log_interval=None)
@@ -63,13 +63,13 @@ def test_settings_are_checked_when_the_agent_is_built(kwargs: dict[str, Any], er
 
 
 @pytest.mark.parametrize("policy", ["PpoPolicy", None, 5])
-def test_policies_are_listed_where_one_is_unknown(policy: Any) -> None:
+def test_an_unknown_policy_lists_the_known_ones(policy: Any) -> None:
     with pytest.raises(ValueError, match=r"policy must be one of .*'FlatMonteCarloPolicy', 'MctsPolicy'.* got "):
         ModelLearningAgent(policy, gym.make(GEYSER))
 
 
 @pytest.mark.parametrize("callback", [5, "x", [5], [None], [lambda local, world: True]])
-def test_what_is_no_callback_is_refused_before_a_step(runner: ModelLearningAgent, callback: Any) -> None:
+def test_invalid_callbacks_are_refused_before_a_step(runner: ModelLearningAgent, callback: Any) -> None:
     with pytest.raises(TypeError, match="callback must be a BaseCallback"):
         runner.learn(10, callback=callback)
     assert runner.num_timesteps == 1500
@@ -89,7 +89,7 @@ def test_no_steps_and_nothing_to_fit_is_refused() -> None:
         ModelLearningAgent("MctsPolicy", gym.make(GEYSER)).learn(0)
 
 
-def test_what_reset_and_step_return_is_no_observation(runner: ModelLearningAgent) -> None:
+def test_the_tuple_that_reset_or_step_returns_is_no_observation(runner: ModelLearningAgent) -> None:
     env = gym.make(GEYSER)
     with pytest.raises(ValueError, match=r"whole tuple that reset\(\) returned; pass its first element"):
         runner.predict(env.reset())  # type: ignore[arg-type]
@@ -97,13 +97,13 @@ def test_what_reset_and_step_return_is_no_observation(runner: ModelLearningAgent
         runner.explain(env.step(0))
 
 
-def test_numbers_of_numpy_are_numbers() -> None:
+def test_numpy_numbers_are_accepted() -> None:
     settings: dict[str, Any] = {"seed": np.int64(3), "num_simulations": np.int64(8), "gamma": np.float64(0.9)}
     agent = ModelLearningAgent("MctsPolicy", gym.make(GEYSER), **settings)
     assert agent.policy.settings.num_simulations == 8
 
 
-def test_no_environment_is_refused() -> None:
+def test_a_missing_environment_is_refused() -> None:
     with pytest.raises(ValueError, match="env must be an environment"):
         ModelLearningAgent("MctsPolicy", None)
 
@@ -124,7 +124,7 @@ class Odd(Corridor):
         (Odd(action=spaces.Tuple([spaces.Discrete(2)])), TypeError, "make it one MultiDiscrete"),
     ],
 )
-def test_spaces_are_refused_before_anything_stumbles_over_them(env: Corridor, error: type[Exception], message: str) -> None:
+def test_unsupported_spaces_are_refused_before_other_errors(env: Corridor, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         ModelLearningAgent("MctsPolicy", env)
 
@@ -142,7 +142,7 @@ def test_an_empty_batch_has_no_actions(runner: ModelLearningAgent) -> None:
         (lambda obs, action: np.ones(len(action)), r"called as fn\(obs, action, next_obs\)"),
     ],
 )
-def test_what_is_no_reward_function_is_refused(runner: ModelLearningAgent, reward: Callable[..., Any], message: str) -> None:
+def test_invalid_reward_functions_are_refused(runner: ModelLearningAgent, reward: Callable[..., Any], message: str) -> None:
     with pytest.raises(TypeError, match=message):
         runner.set_reward(reward)
     assert runner.goals.source == "environment"
@@ -153,7 +153,7 @@ class PaysNaN(Corridor):
         return super().step(action)[0], float("nan"), False, False, {}
 
 
-def test_a_reward_of_nan_is_refused_when_it_is_met() -> None:
+def test_a_reward_of_nan_is_refused_when_it_is_observed() -> None:
     with pytest.raises(ValueError, match="returned a reward of NaN"):
         ModelLearningAgent("MctsPolicy", PaysNaN(), seed=0).learn(10)
 
@@ -173,7 +173,7 @@ def test_weights_that_fit_only_in_part_change_nothing(runner: ModelLearningAgent
     assert all(np.array_equal(before[name], after[name]) for name in before)
 
 
-def test_learning_goes_on_after_loading_without_the_custom_goal(runner: ModelLearningAgent, tmp_path: Path) -> None:
+def test_learning_continues_after_loading_without_the_custom_goal(runner: ModelLearningAgent, tmp_path: Path) -> None:
     runner.set_reward(lambda obs, action, next_obs: next_obs[:, 0])
     runner.save(tmp_path / "left.zip", include=["transitions"])
     runner.set_reward(None)
@@ -199,7 +199,7 @@ def test_policies_are_saved_with_their_agent(runner: ModelLearningAgent, tmp_pat
 
 
 def edited(path: Path, change: Callable[[dict[str, bytes]], None]) -> io.BytesIO:
-    """The file with its entries changed."""
+    """A copy of the file with changed entries."""
     with zipfile.ZipFile(path) as archive:
         entries = {name: archive.read(name) for name in archive.namelist()}
     change(entries)

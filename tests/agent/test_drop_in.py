@@ -1,4 +1,4 @@
-"""Agents in worlds whose spaces are of many kinds."""
+"""Agents in environments with many kinds of spaces."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +15,7 @@ from tests.worlds import Corridor
 
 
 class Bytes(gym.ObservationWrapper[Any, Any, Any]):
-    """A corridor seen as a row of bytes, or as an image; only a few of the values that are declared are ever met."""
+    """A corridor with observations of bytes, or an image; only a few of the declared values ever occur."""
 
     def __init__(self, env: gym.Env[Any, Any], image: bool = False) -> None:
         super().__init__(env)
@@ -30,8 +30,8 @@ class Bytes(gym.ObservationWrapper[Any, Any, Any]):
         return shown
 
 
-class Told(gym.ObservationWrapper[Any, Any, Any]):
-    """A corridor told in another form."""
+class Converted(gym.ObservationWrapper[Any, Any, Any]):
+    """A corridor with converted observations."""
 
     def __init__(self, space: spaces.Space[Any], form: Any) -> None:
         super().__init__(Corridor(limit=50))
@@ -61,15 +61,17 @@ WORLDS: dict[str, Callable[[], gym.Env[Any, Any]]] = {
     "one number": lambda: Corridor(limit=50),
     "bytes": lambda: Bytes(Corridor(limit=50)),
     "image": lambda: Bytes(Corridor(limit=50), image=True),
-    "one large number": lambda: Told(spaces.Discrete(100_000), lambda at: at * 10_000),
-    "bits": lambda: Bits(Told(spaces.Discrete(5000, start=3), lambda at: at + 3)),
-    "wide integers": lambda: Told(spaces.Box(-(2**60), 2**60, (1,), dtype=np.int64), lambda at: np.array([(at - 2) * 10**15])),
-    "dict": lambda: Told(
+    "one large number": lambda: Converted(spaces.Discrete(100_000), lambda at: at * 10_000),
+    "bits": lambda: Bits(Converted(spaces.Discrete(5000, start=3), lambda at: at + 3)),
+    "wide integers": lambda: Converted(
+        spaces.Box(-(2**60), 2**60, (1,), dtype=np.int64), lambda at: np.array([(at - 2) * 10**15])
+    ),
+    "dict": lambda: Converted(
         spaces.Dict({"a": spaces.MultiDiscrete([2, 3], start=[4, 0]), "b": spaces.Discrete(1)}),
         lambda at: {"a": np.array([4 + at % 2, at // 2]), "b": 0},
     ),
-    "tuple": lambda: Told(spaces.Tuple((spaces.Discrete(2), spaces.Discrete(3))), lambda at: (at % 2, at // 2)),
-    "nested": lambda: Flat(Told(NESTED, lambda at: {"a": (at - 2, np.array([[at == 4], [0]], dtype=np.int8)), "b": 0})),
+    "tuple": lambda: Converted(spaces.Tuple((spaces.Discrete(2), spaces.Discrete(3))), lambda at: (at % 2, at // 2)),
+    "nested": lambda: Flat(Converted(NESTED, lambda at: {"a": (at - 2, np.array([[at == 4], [0]], dtype=np.int8)), "b": 0})),
     "bytes with a past": lambda: History(Bytes(Corridor(limit=50)), 1),
 }
 
@@ -80,7 +82,7 @@ def test_any_observation_space_is_learned_and_planned_on(world: str) -> None:
     agent = agent_for(env)
     assert goes_right(agent, env)
     env.observation_space.seed(0)
-    for _ in range(5):  # most of what a space declares was never met
+    for _ in range(5):  # most of the declared values were never observed
         assert env.action_space.contains(int(agent.predict(env.observation_space.sample())[0]))
 
 
@@ -102,27 +104,27 @@ def test_any_action_space_is_planned_with(space: spaces.Space[Any], right: Any) 
     assert goes_right(agent_for(env), env)
 
 
-def test_nested_spaces_are_refused_with_the_way_out() -> None:
+def test_nested_spaces_are_refused_with_a_solution() -> None:
     with pytest.raises(TypeError, match=r"mbagent\.wrappers\.Flat"):
-        ModelLearningAgent("MctsPolicy", Told(NESTED, lambda at: None))
+        ModelLearningAgent("MctsPolicy", Converted(NESTED, lambda at: None))
 
 
 def test_parts_of_one_name_are_refused() -> None:
     space = spaces.Dict({"a.b": spaces.Discrete(2), "a": spaces.Dict({"b": spaces.Discrete(2)})})
     with pytest.raises(ValueError, match=r"'a\.b'"):
-        Flat(Told(space, lambda at: None))
+        Flat(Converted(space, lambda at: None))
     with pytest.raises(TypeError, match="Discrete"):
-        Bits(Told(space, lambda at: None))
+        Bits(Converted(space, lambda at: None))
 
 
 def test_digits_and_numbers_are_inverses() -> None:
-    env = Bits(Told(spaces.Discrete(5000, start=-7), lambda at: at))
+    env = Bits(Converted(spaces.Discrete(5000, start=-7), lambda at: at))
     for number in (-7, 0, 4992):
         assert env.number(env.observation(number)) == number
 
 
 @pytest.mark.parametrize("image", [False, True])
-def test_values_first_met_after_the_fit_are_taken_for_the_nearest(image: bool) -> None:
+def test_values_first_observed_after_the_fit_are_replaced_by_the_nearest(image: bool) -> None:
     env = Bytes(Corridor(limit=50), image)
     agent = agent_for(env)
     obs, _ = env.reset(seed=0)
@@ -133,7 +135,7 @@ def test_values_first_met_after_the_fit_are_taken_for_the_nearest(image: bool) -
     assert len(agent.explain(strange).values) == 2
 
 
-def test_values_met_later_are_learned_later() -> None:
+def test_values_observed_later_are_learned_later() -> None:
     env = Bytes(Corridor(n=3, limit=50))
     agent = agent_for(env)
     assert agent.model.cardinalities == (3, 1, 1)
@@ -145,7 +147,7 @@ def test_values_met_later_are_learned_later() -> None:
     assert goes_right(agent, Bytes(Corridor(limit=50)))
 
 
-def test_values_that_were_met_are_saved(tmp_path: Path) -> None:
+def test_observed_values_are_saved(tmp_path: Path) -> None:
     env = Bytes(Corridor(limit=50))
     agent = agent_for(env)
     agent.save(tmp_path / "agent.zip", include=["transitions"])
@@ -165,7 +167,7 @@ def test_values_that_were_met_are_saved(tmp_path: Path) -> None:
     np.testing.assert_array_equal(fresh.explain(obs).values, agent.explain(obs).values)
 
 
-def test_goals_see_values_as_the_environment_shows_them() -> None:
+def test_goals_get_the_environments_own_values() -> None:
     seen: set[int] = set()
 
     def goal(obs: Any, action: Any, next_obs: Any) -> Any:

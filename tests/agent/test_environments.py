@@ -1,4 +1,4 @@
-"""What an environment does wrong is called the environment's mistake, in one sentence, and costs nothing that was learned."""
+"""Errors of an environment are attributed to it in one sentence, and do not affect what was learned before."""
 
 import warnings
 from collections.abc import Callable
@@ -19,7 +19,7 @@ TWO = spaces.Tuple((spaces.Discrete(5), spaces.Discrete(5)))
 
 
 class Changed(Corridor):
-    """A corridor with another space, whose results are changed."""
+    """A corridor with another space and modified results."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ def test_observations_that_are_not_of_the_space_are_the_environments_mistake(
         learned(Changed(space, show))
 
 
-def test_so_they_are_where_a_vector_environment_returns_them() -> None:
+def test_observations_of_vector_environments_are_checked_too() -> None:
     with pytest.raises(ValueError, match=r"environment violates its own observation_space: .* value 3"):
         learned(DummyVecEnv([lambda: Changed(spaces.Discrete(3))]))
 
@@ -94,12 +94,12 @@ def test_results_of_another_form_are_the_environments_mistake(changes: dict[str,
         learned(Changed(**changes))
 
 
-def test_rewards_of_any_kind_of_number_are_taken() -> None:
+def test_rewards_of_any_numeric_type_are_accepted() -> None:
     env = Changed(step=lambda r: (r[0], np.array(r[1], dtype=np.int64), *r[2:]))
     assert set(learned(env).transitions.rows().rewards) == {0.0, 1.0}
 
 
-def test_what_was_met_before_a_mistake_is_kept() -> None:
+def test_transitions_before_an_error_are_kept() -> None:
     agent, env = learned(Corridor(limit=20)), Changed(step=lambda r: r if env.steps < 3 else r[:4])
     agent.set_env(env)
     with pytest.raises(TypeError, match="returned 4 values"):
@@ -118,7 +118,7 @@ def test_what_was_met_before_a_mistake_is_kept() -> None:
         (lambda: 5, "env must be a Gymnasium environment, .* got 5"),
     ],
 )
-def test_what_is_no_environment_of_sb3_is_refused(make: Callable[[], Any], message: str) -> None:
+def test_environments_that_sb3_does_not_support_are_refused(make: Callable[[], Any], message: str) -> None:
     with pytest.raises(TypeError, match=message):
         ModelLearningAgent("MctsPolicy", make())
 
@@ -130,7 +130,7 @@ def test_normalized_observations_are_refused() -> None:
 
 
 class Walk(Corridor):
-    """A corridor with some ``reward_fn``."""
+    """A corridor with a given ``reward_fn``."""
 
     def __init__(self, reward_fn: Any) -> None:
         super().__init__(limit=20)
@@ -146,7 +146,7 @@ class Broken(Corridor):
 
 
 class Helper(Corridor):
-    """A corridor with a method of its own that happens to be called ``reward_fn``."""
+    """A corridor with an unrelated method called ``reward_fn``."""
 
     def reward_fn(self) -> float:
         return float(self.at == self.n - 1)
@@ -177,7 +177,7 @@ def test_a_reward_fn_that_is_no_reward_function_is_named_and_the_reward_is_learn
 
 
 class Seeker(Corridor):
-    """A corridor without an end that pays 1 at a cell, which can be changed; with or without a ``reward_fn`` that knows it."""
+    """An endless corridor with reward 1 at a cell, which can be changed; with or without a ``reward_fn``."""
 
     def __init__(self, knows: bool) -> None:
         super().__init__(limit=20)
@@ -194,7 +194,7 @@ class Seeker(Corridor):
 
 
 @pytest.mark.parametrize(("knows", "source"), [(False, "learned"), (True, "environment")])
-def test_plans_follow_rewards_that_change_while_learning_goes_on(knows: bool, source: str) -> None:
+def test_plans_follow_rewards_that_change_during_learning(knows: bool, source: str) -> None:
     agent = ModelLearningAgent("MctsPolicy", Seeker(knows), seed=0, model="tabular")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The environment has no reward_fn")
@@ -206,5 +206,5 @@ def test_plans_follow_rewards_that_change_while_learning_goes_on(knows: bool, so
         assert int(agent.predict(np.array(2))[0]) == 1
         assert agent.goals.source == source
         agent.set_env(agent.get_env())  # type: ignore[arg-type]
-        agent.learn(400, log_interval=None)  # rewards are those observed since, and there is nothing to warn of
+        agent.learn(400, log_interval=None)  # earlier rewards are ignored, so there is no warning
     assert int(agent.predict(np.array(2))[0]) == 1

@@ -1,4 +1,4 @@
-"""The one-way arrows of the house."""
+"""Which packages may import which."""
 
 import ast
 from pathlib import Path
@@ -24,7 +24,7 @@ def imported(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("folder", FORBIDDEN)
-def test_data_flows_one_way(folder: str) -> None:
+def test_imports_go_one_way(folder: str) -> None:
     for path in sorted((ROOT / folder).rglob("*.py")):
         for name in imported(path):
             assert not any(name == other or name.startswith(f"{other}.") for other in FORBIDDEN[folder]), f"{path}: {name}"

@@ -1,4 +1,4 @@
-"""What ``predict`` and ``set_reward`` promise: what they depend on, what they drop, and what happens when a goal fails."""
+"""Contract of ``predict`` and ``set_reward``: dependencies, invalidation of caches, and failing reward functions."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +19,7 @@ POLICIES = ["MctsPolicy", "FlatMonteCarloPolicy", "ValueIterationPolicy"]
 
 @pytest.fixture(scope="module")
 def learned() -> dict[str, Any]:
-    """Weights of an agent that has learned a world too large to solve as a whole."""
+    """Weights of an agent for an MDP that is too large to be solved completely."""
     return ModelLearningAgent("MctsPolicy", gym.make(CATCHER), seed=0).learn(1500, log_interval=None).get_parameters()
 
 
@@ -59,7 +59,7 @@ def test_both_flags_and_any_history_give_the_same_action(policy: str, learned: d
 
 
 class Failing:
-    """Works so long as it is asked about a few transitions, then fails: in the middle of planning, but not when it is given."""
+    """Fails after a number of calls: during planning, but not when it is set."""
 
     def __init__(self, calls: int) -> None:
         self.calls = calls
@@ -73,11 +73,11 @@ class Failing:
 
 @pytest.mark.parametrize("policy", POLICIES)
 @pytest.mark.parametrize("calls", [1, 2, 3])
-def test_a_reward_that_fails_while_planning_is_named_and_leaves_no_trace(
+def test_a_reward_that_fails_during_planning_is_named_and_has_no_lasting_effect(
     policy: str, calls: int, learned: dict[str, Any]
 ) -> None:
     if policy == "ValueIterationPolicy" and calls == 3:
-        calls = 2  # it scores everything in one call, after the trial when the goal is given
+        calls = 2  # it evaluates all transitions in one call, after the test call when the goal is set
     agent, obs = catcher(policy, learned), observations()
     failing = Failing(calls)
     agent.set_reward(failing)
@@ -89,7 +89,7 @@ def test_a_reward_that_fails_while_planning_is_named_and_leaves_no_trace(
     while traceback is not None and traceback.tb_next is not None:
         traceback = traceback.tb_next
     assert traceback is not None
-    assert traceback.tb_frame.f_code.co_name == "__call__"  # the user's own line is there to see
+    assert traceback.tb_frame.f_code.co_name == "__call__"  # the traceback contains the user's own line
     agent.set_reward(top)
     fresh = catcher(policy, learned, reward=top)
     np.testing.assert_array_equal(values(agent, obs), values(fresh, obs))
@@ -97,7 +97,7 @@ def test_a_reward_that_fails_while_planning_is_named_and_leaves_no_trace(
     np.testing.assert_array_equal(values(agent, obs), values(catcher(policy, learned), obs))
 
 
-def test_a_reward_that_fails_at_once_is_refused_and_the_old_goal_stays(learned: dict[str, Any]) -> None:
+def test_a_reward_that_fails_immediately_is_refused_and_the_old_goal_is_kept(learned: dict[str, Any]) -> None:
     agent, obs = catcher("MctsPolicy", learned), observations(2)
     before = values(agent, obs)
     with pytest.raises(RuntimeError, match=r"reward function .*<lambda> raised IndexError"):
@@ -127,7 +127,7 @@ def test_new_weights_and_more_learning_are_planned_with() -> None:
 
 
 class Switches(Corridor):
-    """An observation of parts and an action of two variables."""
+    """A nested observation and an action of two variables."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -178,9 +178,9 @@ def test_actions_before_the_first_fit_are_valid_random_and_seeded() -> None:
     assert len({tuple(action) for action in actions(1)}) == 6
 
 
-def test_rewards_that_the_environments_own_function_does_not_give_are_learned() -> None:
+def test_rewards_that_differ_from_the_environments_reward_fn_are_learned() -> None:
     env = gym.wrappers.TransformReward(gym.make("mbagent/GeyserRunner-v0"), lambda reward: -float(reward))
-    with pytest.warns(UserWarning, match=r"reward_fn differs from \d+ of the 1000 rewards met"):
+    with pytest.warns(UserWarning, match=r"reward_fn differs from \d+ of the 1000 rewards observed"):
         agent = ModelLearningAgent("MctsPolicy", env, seed=0).learn(1000, log_interval=None)
     assert agent.goals.source == "learned"
 
@@ -199,7 +199,7 @@ def test_a_kept_tree_is_dropped_at_episode_starts_and_with_goals(learned: dict[s
     assert isinstance(planner, MctsPlanner)
 
     def decisions(change: Callable[[], Any], start: bool = False) -> int:
-        """How many decisions the kept tree is old, after a change and one more."""
+        """Age of the kept tree in decisions, after a change and one more decision."""
         change()
         agent.predict(obs, episode_start=np.array([start]))
         assert planner._last is not None
@@ -209,7 +209,7 @@ def test_a_kept_tree_is_dropped_at_episode_starts_and_with_goals(learned: dict[s
     assert decisions(lambda: None, start=True) == 0
     assert decisions(lambda: None) == 1
     assert decisions(lambda: agent.set_reward(top)) == 0
-    assert decisions(lambda: agent.explain(obs)) == 1  # nor does an explanation touch it
+    assert decisions(lambda: agent.explain(obs)) == 1  # nor does an explanation affect it
     assert decisions(lambda: agent.set_parameters(learned)) == 0
     assert decisions(lambda: agent.predict(np.stack([obs, obs]))) == 0
 
@@ -234,7 +234,7 @@ def test_planning_settings_out_of_range_are_refused(policy: str, kwargs: dict[st
 
 
 @pytest.mark.parametrize("wrong", ["a", None, {"a": 1}, [[1, 2], [3]]])
-def test_what_is_no_observation_at_all_gets_one_sentence(wrong: Any) -> None:
+def test_non_numeric_observations_raise_an_error_of_one_sentence(wrong: Any) -> None:
     agent = ModelLearningAgent("MctsPolicy", gym.make("FrozenLake-v1"), seed=0)
     with pytest.raises(ValueError, match="must be numbers of Discrete"):
         agent.predict(wrong)

@@ -1,4 +1,4 @@
-"""An agent that is pruned plans on; one that cannot be is told why in one sentence, and is as it was."""
+"""A pruned agent continues to plan; an agent that cannot be pruned raises an error of one sentence and is unchanged."""
 
 from pathlib import Path
 
@@ -28,7 +28,7 @@ def agent(model: str = "small networks") -> ModelLearningAgent:
     return ModelLearningAgent("MctsPolicy", env, seed=0, model=model, num_simulations=4, horizon=3)
 
 
-def test_a_pruned_agent_plans_on_with_its_goal_and_survives_saving(tmp_path: Path) -> None:
+def test_a_pruned_agent_keeps_its_goal_and_can_be_saved(tmp_path: Path) -> None:
     one = agent().learn(400, log_interval=None)
     one.set_reward(lambda obs, action, next_obs: next_obs[:, 0].astype(float))
     obs = np.stack([one.observation_space.sample() for _ in range(4)])
@@ -39,12 +39,12 @@ def test_a_pruned_agent_plans_on_with_its_goal_and_survives_saving(tmp_path: Pat
     one.save(tmp_path / "pruned.zip", include=["transitions"])
     other = ModelLearningAgent.load(tmp_path / "pruned.zip", reward=lambda obs, action, next_obs: next_obs[:, 0].astype(float))
     assert np.array_equal(other.predict(obs)[0], actions)
-    other.prune(0.8)  # with transitions it goes on
+    other.prune(0.8)  # possible with transitions
     assert other.fit_report is not None
-    assert other.fit_report.log["pruned"] >= 0.79  # at least what was asked for
+    assert other.fit_report.log["pruned"] >= 0.79  # at least the requested share
 
 
-def test_mistakes_get_one_sentence_and_change_nothing(tmp_path: Path) -> None:
+def test_mistakes_raise_an_error_of_one_sentence_and_change_nothing(tmp_path: Path) -> None:
     one = agent()
     with pytest.raises(ValueError, match="call learn"):
         one.prune(0.5)

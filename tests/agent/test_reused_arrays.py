@@ -1,4 +1,4 @@
-"""Environments that use their arrays and dicts again are learned as if they returned new ones."""
+"""Environments that reuse their arrays and dicts are learned as if they returned new ones."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ def goal(obs: Any, action: Any, next_obs: Any) -> Any:
 
 
 class Switches(gym.Env[Any, Any]):
-    """Turns on one switch at a time; over when all are on. Shows, in a space of its kind, the arrays that reset clears."""
+    """Turns on one switch per step; terminates when all are on. Its observations are arrays that reset overwrites."""
 
     def __init__(self, kind: str = "array", limit: int | None = None, copies: bool = False, infos: bool = False) -> None:
         self.on, self.count = np.zeros(N, np.int8), np.zeros(1, np.int64)
@@ -37,7 +37,7 @@ class Switches(gym.Env[Any, Any]):
 
     def show(self) -> Any:
         if self.kind == "replaced":
-            self.shown["on"] = self.on.copy()  # the dict is used again, its array is not
+            self.shown["on"] = self.on.copy()  # the dict is reused, but not its array
         return self.on.copy() if self.copies else self.shown
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -50,7 +50,7 @@ class Switches(gym.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.on[action[0]] = 1
         self.count[0], self.steps = self.on.sum(), self.steps + 1
-        action[:] = 0  # its array is the environment's as long as the step takes
+        action[:] = 0  # the environment may modify the action's array during the step
         self.info["steps"] = self.steps
         return self.show(), 0.0, bool(self.on.all()), self.steps == self.limit, self.info if self.infos else {}
 
@@ -80,23 +80,23 @@ def test_every_transition_is_recorded_as_it_was(kind: str, limit: int | None) ->
     assert not on.all(axis=1).any()
 
 
-def test_wrappers_of_the_users_own_change_nothing() -> None:
+def test_additional_wrappers_change_nothing() -> None:
     rows = learned(Monitor(gym.wrappers.TimeLimit(Switches(), 4))).transitions.rows()
     np.testing.assert_array_equal(rows.next_states, expected(rows.states, rows.actions))
 
 
-def test_ends_that_a_vector_environment_overwrites_are_reported() -> None:
+def test_overwritten_last_observations_are_reported() -> None:
     with pytest.warns(UserWarning, match=r"All \d+ episodes so far ended with the observation .* obs\.copy"):
         learned(DummyVecEnv([Switches, lambda: Switches(limit=4)]))
 
 
-def test_a_last_observation_that_is_missing_is_named() -> None:
+def test_a_missing_last_observation_is_named() -> None:
     with pytest.raises(ValueError, match=r"without infos\[0\]\['terminal_observation'\]"):
         learned(DummyVecEnv([lambda: Switches(infos=True)]))
 
 
 class Loop(gym.Env[Any, Any]):
-    """One step an episode; ends in the start state: always the only one, or by chance one of two."""
+    """Episodes of one step that end in a random one of n start states, as does the reset."""
 
     def __init__(self, n: int) -> None:
         self.observation_space, self.action_space = spaces.Discrete(n), spaces.Discrete(2)
@@ -113,7 +113,7 @@ class Loop(gym.Env[Any, Any]):
 
 
 @pytest.mark.parametrize("make", [lambda: Switches(copies=True), lambda: Loop(1), lambda: Loop(2)])
-def test_sound_vector_environments_are_not_reported(make: Any) -> None:
+def test_correct_vector_environments_are_not_reported(make: Any) -> None:
     assert len(learned(DummyVecEnv([make, make])).transitions) == 300  # warnings are errors here
 
 
@@ -132,7 +132,7 @@ class OneBuffer(VecEnvWrapper):
         return self.obs, self.rewards, self.dones, infos
 
 
-def test_buffers_of_vector_environments_are_read_at_once() -> None:
+def test_buffers_of_vector_environments_are_copied() -> None:
     rows = learned(OneBuffer(DummyVecEnv([lambda: Switches(copies=True)] * 2))).transitions.rows()
     np.testing.assert_array_equal(rows.next_states, expected(rows.states, rows.actions))
     going = ~rows.terminated

@@ -49,7 +49,7 @@ def test_predictions_are_the_same_after_loading(agent: ModelLearningAgent, tmp_p
     assert before.tolist() == after.tolist() == alone
 
 
-def test_a_loaded_agent_learns_on(agent: ModelLearningAgent, tmp_path: Path) -> None:
+def test_a_loaded_agent_continues_to_learn(agent: ModelLearningAgent, tmp_path: Path) -> None:
     agent.save(tmp_path / "agent", include=["transitions"])
     loaded = ModelLearningAgent.load(tmp_path / "agent", env=gym.make(GEYSER, hit_cost=5.0), num_simulations=8)
     assert loaded.num_simulations == 8
@@ -67,7 +67,7 @@ def test_transitions_are_included_by_name_or_in_a_list(agent: ModelLearningAgent
     assert not (tmp_path / "other.zip").exists()
 
 
-def test_learning_on_without_the_transitions_is_warned_of(agent: ModelLearningAgent, tmp_path: Path) -> None:
+def test_learning_without_the_earlier_transitions_gives_a_warning(agent: ModelLearningAgent, tmp_path: Path) -> None:
     agent.save(tmp_path / "agent")
     loaded = ModelLearningAgent.load(tmp_path / "agent", env=gym.make(GEYSER, hit_cost=5.0))
     with pytest.warns(UserWarning, match="will replace what it knows"):
@@ -89,7 +89,7 @@ def test_a_custom_reward_must_be_given_again(agent: ModelLearningAgent, tmp_path
     assert again.predict(observations())[0].tolist() == expected.tolist()
 
 
-def test_parameters_travel_between_agents(agent: ModelLearningAgent, tmp_path: Path) -> None:
+def test_parameters_can_be_transferred_between_agents(agent: ModelLearningAgent, tmp_path: Path) -> None:
     agent.save(tmp_path / "agent.zip")
     for source in (agent.get_parameters(), str(tmp_path / "agent.zip")):
         other = ModelLearningAgent("MctsPolicy", gym.make(GEYSER, hit_cost=5.0), seed=9)
@@ -139,14 +139,14 @@ def test_a_file_with_code_in_it_is_refused_by_the_entrys_name(tmp_path: Path) ->
         ModelLearningAgent.load(tmp_path / "evil.zip")
 
 
-def test_a_file_of_another_algorithm_is_told_to_be_one(agent: ModelLearningAgent, tmp_path: Path) -> None:
+def test_a_file_of_another_algorithm_is_recognised(agent: ModelLearningAgent, tmp_path: Path) -> None:
     PPO("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8).save(tmp_path / "ppo.zip")
     for load in (ModelLearningAgent.load, agent.set_parameters):
         with pytest.raises(ValueError, match=r"ppo\.zip was saved by another .* algorithm.*PPO\.load"):
             load(str(tmp_path / "ppo.zip"))
 
 
-def test_missing_and_damaged_files_are_told_apart(tmp_path: Path) -> None:
+def test_missing_and_damaged_files_have_different_errors(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="nowhere"):
         ModelLearningAgent.load(tmp_path / "nowhere")
     (tmp_path / "noise.zip").write_bytes(b"noise")
@@ -181,7 +181,7 @@ def test_spaces_survive_json(space: spaces.Space[Any]) -> None:
     assert checkpoint.space_from_json(json.loads(json.dumps(checkpoint.space_to_json(space)))) == space
 
 
-def test_transitions_travel_in_plain_files(agent: ModelLearningAgent, tmp_path: Path) -> None:
+def test_transitions_can_be_transferred_in_plain_files(agent: ModelLearningAgent, tmp_path: Path) -> None:
     agent.save_transitions(str(tmp_path / "seen"))
     other = ModelLearningAgent("MctsPolicy", gym.make(GEYSER), seed=3)
     other.load_transitions(str(tmp_path / "seen"))

@@ -1,4 +1,4 @@
-"""Environments in processes of their own: what the agent asks of them, and what is left when one of them ends."""
+"""Environments in subprocesses: requests of the agent, and the state after one of them ends."""
 
 import os
 import threading
@@ -22,14 +22,14 @@ LEARNED = r"The environment has no reward_fn, so the agent plans with a reward l
 
 
 class Paid(Corridor):
-    """A corridor that tells its reward function."""
+    """A corridor with a reward function."""
 
     def reward_fn(self, obs: Any, action: Any, next_obs: Any) -> Any:
         return (next_obs == self.n - 1).astype(float)
 
 
 class Unpicklable(Paid):
-    """One whose bound methods cannot leave its process."""
+    """A corridor whose bound methods cannot be pickled."""
 
     def __init__(self) -> None:
         super().__init__(limit=20)
@@ -37,7 +37,7 @@ class Unpicklable(Paid):
 
 
 class Anonymous(Corridor):
-    """One whose reward function has no name to be pickled by."""
+    """A corridor whose reward function has no name and so cannot be pickled."""
 
     def __init__(self) -> None:
         super().__init__(limit=20)
@@ -45,7 +45,7 @@ class Anonymous(Corridor):
 
 
 class Breaking(Corridor):
-    """A corridor of which one step raises, or ends its process at once."""
+    """A corridor in which one step raises an error or terminates its process."""
 
     def __init__(self, after: int, error: type[Exception] | None = ValueError) -> None:
         super().__init__(limit=20)
@@ -62,7 +62,7 @@ class Breaking(Corridor):
 
 @pytest.fixture
 def started() -> Iterator[list[SubprocVecEnv]]:
-    """Vector environments to be closed when the test ends."""
+    """Vector environments that are closed at the end of the test."""
     made: list[SubprocVecEnv] = []
     yield made
     for env in made:
@@ -106,7 +106,7 @@ def test_environments_without_reward_fn_are_learned_in_other_processes(wrap: Cal
 
 
 @pytest.mark.parametrize("make", [Paid, lambda: Monitor(Paid())])
-def test_a_reward_fn_that_can_be_pickled_comes_over(make: Callable[[], gym.Env[Any, Any]], start: Start) -> None:
+def test_a_picklable_reward_fn_is_used(make: Callable[[], gym.Env[Any, Any]], start: Start) -> None:
     agent = agent_in(start(make, make)).learn(400, log_interval=None)
     assert agent.goals.source == "environment"
     assert goes_right(agent)
@@ -120,7 +120,7 @@ def test_a_reward_fn_that_cannot_be_pickled_ends_no_process(make: Callable[[], g
     assert goes_right(agent)
 
 
-def test_a_process_that_shares_nothing_can_be_asked(start: Start) -> None:
+def test_forkserver_processes_are_supported(start: Start) -> None:
     agent = agent_in(start(Anonymous, method="forkserver"))
     with pytest.warns(UserWarning, match="cannot be pickled"):
         agent.learn(100, log_interval=None)
@@ -170,12 +170,14 @@ def test_an_error_of_an_environment_in_this_process_passes_unchanged(error: type
     with pytest.raises(error, match="the pump is broken"):
         agent.learn(1000, log_interval=None)
     assert len(agent.experience.dataset) == 149
-    at = broken.at = 2  # as no reset would leave it
+    at = broken.at = 2  # a position that no reset produces
     with pytest.warns(UserWarning, match=LEARNED):
         agent.learn(0)
     assert broken.at == at
     assert goes_right(agent)
-    agent.learn(50, log_interval=None, reset_num_timesteps=False)  # begins with a reset: no step led from where it was to there
+    agent.learn(
+        50, log_interval=None, reset_num_timesteps=False
+    )  # begins with a reset, so no transition starts at the old position
     rows = agent.experience.dataset.rows()
     assert len(rows) == 199
     assert rows.states[149, 0] == 0

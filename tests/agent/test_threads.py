@@ -1,4 +1,4 @@
-"""What threads that share an agent may count on: the answers of one thread alone, and no lasting trace of what fails."""
+"""Threads that share an agent: results are those of a single thread, and failed calls have no lasting effect."""
 
 import copy
 import pickle
@@ -17,12 +17,12 @@ from tests.worlds import Corridor
 
 CATCHER = "mbagent/FlierCatcher-v0"
 WAIT = 120.0
-"""Seconds after which a thread that does not end fails the test; none comes near."""
+"""Seconds after which a running thread fails the test; far above the usual time."""
 
 
 @pytest.fixture(scope="module")
 def catcher() -> ModelLearningAgent:
-    """An agent that has learned a world too large to solve as a whole."""
+    """An agent for an MDP that is too large to be solved completely."""
     env, kwargs = gym.make(CATCHER, height=4, width=6), {"max_states": 300, "lookahead_states": 60, "learn_values": False}
     agent = ModelLearningAgent("MctsPolicy", env, seed=0, num_simulations=32, policy_kwargs=kwargs)
     return agent.learn(800, log_interval=None)
@@ -30,7 +30,7 @@ def catcher() -> ModelLearningAgent:
 
 @pytest.fixture
 def busy() -> Iterator[None]:
-    """Lets threads take turns far more often than usual."""
+    """Makes threads switch far more often than usual."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(1e-5)
     yield
@@ -44,7 +44,7 @@ def observations(n: int) -> np.ndarray:
 
 
 def together(*tasks: Callable[[], Any]) -> list[Any]:
-    """What functions return that run at once, each in a thread of its own."""
+    """Results of functions that run concurrently, each in a separate thread."""
     with ThreadPoolExecutor(len(tasks)) as pool:
         futures = [pool.submit(task) for task in tasks]
         return [future.result(WAIT) for future in futures]
@@ -72,7 +72,7 @@ def arriving(at: int) -> Callable[[Any, Any, Any], Any]:
 
 
 @pytest.mark.usefixtures("busy")
-def test_predict_beside_set_reward_plans_for_one_goal_or_the_other() -> None:
+def test_predict_during_set_reward_plans_for_one_goal_or_the_other() -> None:
     goals = [arriving(0), arriving(3)]
     agent = ModelLearningAgent("MctsPolicy", Corridor(limit=30), seed=0, model="tabular", reward=goals[0])
     agent.learn(400, log_interval=None)
@@ -97,7 +97,7 @@ def test_predict_beside_set_reward_plans_for_one_goal_or_the_other() -> None:
 
 
 @pytest.mark.usefixtures("busy")
-def test_predict_explain_and_save_beside_learn(tmp_path: Any) -> None:
+def test_predict_explain_and_save_during_learn(tmp_path: Any) -> None:
     agent = ModelLearningAgent("MctsPolicy", Corridor(limit=30), seed=0, model="tabular", reward=arriving(3))
     agent.learn(100, log_interval=None)
 
@@ -129,10 +129,10 @@ def test_environments_of_one_model_in_many_threads(catcher: ModelLearningAgent) 
 
 @pytest.mark.parametrize("call", [1, 2, 3, 5])
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError])
-def test_planning_that_was_broken_off_leaves_no_trace_and_no_lock(
+def test_interrupted_planning_leaves_no_partial_results_and_no_lock(
     error: type[BaseException], call: int, catcher: ModelLearningAgent
 ) -> None:
-    agent, obs, calls = copy.deepcopy(catcher), observations(3), -1  # the first call is the trial when the goal is given
+    agent, obs, calls = copy.deepcopy(catcher), observations(3), -1  # the first call is the test when the goal is set
 
     def once(obs: Any, action: Any, next_obs: Any) -> Any:
         nonlocal calls
@@ -150,7 +150,7 @@ def test_planning_that_was_broken_off_leaves_no_trace_and_no_lock(
 
 
 @pytest.mark.parametrize("call", [1, 2, 5, 20])
-def test_learning_values_that_was_broken_off_is_begun_anew(call: int) -> None:
+def test_interrupted_learning_of_values_is_started_again(call: int) -> None:
     kwargs = {"max_states": 5, "lookahead_states": 5}
     agent = ModelLearningAgent("MctsPolicy", Corridor(30, limit=60), seed=0, model="tabular", policy_kwargs=kwargs)
     obs, calls = np.arange(20, 25), -1
@@ -171,7 +171,7 @@ def test_learning_values_that_was_broken_off_is_begun_anew(call: int) -> None:
     assert decided(agent, obs) == alone
 
 
-def test_a_fit_that_was_broken_off_is_undone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_fit_is_undone(monkeypatch: pytest.MonkeyPatch) -> None:
     agent = ModelLearningAgent("MctsPolicy", Corridor(limit=30), seed=0, reward=arriving(3), model="tabular")
     agent.learn(30, log_interval=None)
     before, alone = agent.get_parameters()["policy"], agent.explain(2).values
@@ -197,7 +197,7 @@ def test_a_fit_that_was_broken_off_is_undone(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("use", ["predict", "explain", "set_reward"])
-def test_a_reward_function_that_uses_the_agent_that_plans_with_it_is_told_so(use: str, catcher: ModelLearningAgent) -> None:
+def test_a_reward_function_that_uses_the_planning_agent_raises_an_error(use: str, catcher: ModelLearningAgent) -> None:
     agent, obs, calls = copy.deepcopy(catcher), observations(1)[0], 0
 
     def nosy(before: Any, action: Any, after: Any) -> Any:

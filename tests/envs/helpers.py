@@ -1,4 +1,4 @@
-"""What the tests of the games share: games with many arguments, a tiny game that ends, a way to play."""
+"""Shared parts of the tests of the games: games with many arguments, a tiny game that terminates, a player."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ DEFAULTS: list[Game] = [TYPES[env_id]() for env_id in VARIANTS]
 
 
 class Lottery(Game):
-    """A game that ends: three lamps, one lit; "go" lights a random one, and the last one ends the episode."""
+    """A game that terminates: three lamps, one lit; "go" lights a random one, and the last one ends the episode."""
 
     max_episode_steps: ClassVar[int] = 50
 
@@ -79,12 +79,12 @@ class Lottery(Game):
 
 
 def start_states(game: Game, count: int, seed: int = 0) -> Bits:
-    """Return fresh start states ``[count, *shape]``."""
+    """Return random start states ``[count, *shape]``."""
     return game.initial(derive(seed, np.arange(count)))
 
 
 def wandered_states(game: Game, count: int, steps: int = 12, seed: int = 0) -> Bits:
-    """Return states ``[count, *shape]`` met after some random steps."""
+    """Return states ``[count, *shape]`` after some random steps."""
     obs = start_states(game, count, seed)
     rng = np.random.default_rng(seed)
     for step in range(steps):

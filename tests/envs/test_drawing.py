@@ -49,7 +49,7 @@ def test_every_kind_can_be_seen_on_every_background(kind: str) -> None:
 
 
 def test_the_player_is_where_the_observation_says() -> None:
-    """The player is the only thing in coral."""
+    """The player is the only coral object."""
     for game in GAMES:
         for obs in wandered_states(game, 5):
             scene = game.scene(obs)

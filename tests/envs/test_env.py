@@ -31,7 +31,7 @@ def no_screen(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @each_variant
 @pytest.mark.parametrize("render_mode", [None, "rgb_array", "ansi"])
-def test_gymnasium_and_sb3_find_nothing_to_say(env_id: str, arguments: dict[str, Any], render_mode: str | None) -> None:
+def test_gymnasium_and_sb3_checkers_give_no_warning(env_id: str, arguments: dict[str, Any], render_mode: str | None) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env = gym.make(env_id, render_mode=render_mode, **arguments)
@@ -42,7 +42,7 @@ def test_gymnasium_and_sb3_find_nothing_to_say(env_id: str, arguments: dict[str,
 
 
 @each_id
-def test_the_checkers_find_nothing_to_say_about_windows(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_checkers_give_no_warning_about_windows(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(GameEnv.metadata, "render_fps", 1000)  # no waiting
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -53,12 +53,12 @@ def test_the_checkers_find_nothing_to_say_about_windows(env_id: str, monkeypatch
 
 
 @each_variant
-def test_an_episode_follows_from_its_key(env_id: str, arguments: dict[str, Any]) -> None:
+def test_an_episode_is_determined_by_its_key(env_id: str, arguments: dict[str, Any]) -> None:
     env, inner = make(env_id, **arguments)
     game = inner.game
     obs, info = env.reset(seed=4)
     assert info == {}
-    key = draw_keys(np.random.Generator(np.random.PCG64(4)), 1)  # as gymnasium.utils.seeding makes it
+    key = draw_keys(np.random.Generator(np.random.PCG64(4)), 1)  # as created by gymnasium.utils.seeding
     np.testing.assert_array_equal(obs, game.initial(derive(key, 0))[0])
     rng = np.random.default_rng(0)
     for t in range(1, game.max_episode_steps + 1):
@@ -89,14 +89,14 @@ def test_unseeded_episodes_differ_and_returned_data_is_the_callers(env_id: str) 
         paths.append(np.array(path).tobytes())
     assert len(set(paths)) == 4
     first, _ = env.reset(seed=1)
-    first[:] = 1  # spoils nothing
+    first[:] = 1  # has no effect on the environment
     second = env.step(0)[0]
     env.reset(seed=1)
     np.testing.assert_array_equal(env.step(0)[0], second)
 
 
 @each_id
-def test_true_rules_are_offered_without_touching_the_episode(env_id: str) -> None:
+def test_true_rules_are_available_without_changing_the_episode(env_id: str) -> None:
     env, inner = make(env_id)
     obs, _ = env.reset(seed=2)
     batch = np.repeat(obs[None], 50, axis=0)
@@ -136,7 +136,7 @@ def test_a_wrong_action_is_one_clear_error_and_changes_nothing(env_id: str, acti
 
 
 @each_id
-def test_nothing_works_before_the_first_reset(env_id: str) -> None:
+def test_step_and_render_before_the_first_reset_raise_errors(env_id: str) -> None:
     env, inner = make(env_id, render_mode="ansi")
     for either in (env, inner):
         with pytest.raises(gym.error.ResetNeeded):
@@ -158,7 +158,7 @@ def test_an_episode_may_start_from_a_given_state(env_id: str) -> None:
     np.testing.assert_array_equal(state, kept)
     with pytest.raises(ValueError, match="not a state of"):
         env.reset(options={"state": np.zeros_like(state)})
-    with pytest.raises(ValueError, match="reset knows no option 'walls'; its options are 'state'"):
+    with pytest.raises(ValueError, match="reset has no option 'walls'; its options are 'state'"):
         env.reset(options={"walls": 3})
     env.reset(options={})
 
@@ -166,7 +166,7 @@ def test_an_episode_may_start_from_a_given_state(env_id: str) -> None:
 def test_a_refused_reset_leaves_the_episode_alone() -> None:
     env, _ = make("mbagent/FlierCatcher-v0")
     env.reset(seed=0)
-    with pytest.raises(ValueError, match="knows no option"):
+    with pytest.raises(ValueError, match="has no option"):
         env.unwrapped.reset(seed=99, options={"bogus": 1})
     after = env.step(1)[0]
     env.reset(seed=0)

@@ -27,7 +27,7 @@ def test_starts_anywhere_in_the_first_column_without_fliers() -> None:
     assert not obs[:, 1].any()
 
 
-def test_player_moves_and_fliers_come_nearer() -> None:
+def test_player_and_fliers_move() -> None:
     before = board("@.<.", "<..<", "..<.")
     np.testing.assert_array_equal(step(before, "stay"), board("@<..", "..<.", ".<.."))
     np.testing.assert_array_equal(step(before, "down"), board(".<..", "@.<.", ".<.."))
@@ -38,7 +38,7 @@ def test_player_moves_and_fliers_come_nearer() -> None:
     assert FlierCatcher(stay=False).action_names == ("up", "down")
 
 
-def test_new_fliers_come_at_the_given_rate_in_any_row() -> None:
+def test_new_fliers_appear_at_the_given_rate_in_any_row() -> None:
     game, n = FlierCatcher(spawn_rate=0.3), 20_000
     after = game.transition(start_states(game, n), np.ones(n, dtype=np.int64), derive(1, np.arange(n)))
     assert not after[:, 1, :, :-1].any()
@@ -47,7 +47,7 @@ def test_new_fliers_come_at_the_given_rate_in_any_row() -> None:
     assert after[:, 1].sum(axis=(1, 2)).max() == 1
 
 
-def test_reward_is_a_flier_at_the_players_cell_afterwards() -> None:
+def test_reward_is_1_for_a_flier_at_the_players_next_cell() -> None:
     game = FlierCatcher(height=3, width=4)
     before = board("@...", ".<..", "....")
     for action, reward in (("down", 1), ("stay", 0), ("up", 0)):
@@ -55,7 +55,7 @@ def test_reward_is_a_flier_at_the_players_cell_afterwards() -> None:
         assert game.reward(before[None], number, step(before, action)[None]) == reward
 
 
-def test_other_goals_mean_what_they_say() -> None:
+def test_other_goals_are_as_documented() -> None:
     game = FlierCatcher(height=3, width=4)
     boards = np.array(
         [
@@ -87,12 +87,12 @@ def test_other_goals_mean_what_they_say() -> None:
         ({"stay": "yes"}, TypeError, "stay must be True or False"),
     ],
 )
-def test_impossible_arguments_are_named(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
+def test_invalid_arguments_are_named(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         FlierCatcher(**arguments)
 
 
-def test_players_elsewhere_and_crowded_columns_are_no_states() -> None:
+def test_invalid_boards_are_refused() -> None:
     game = FlierCatcher(height=3, width=4)
     game.check_observations(wandered_states(game, 100))
     for wrong in (board(".@..", "....", "...."), board("@...", "@...", "....")):

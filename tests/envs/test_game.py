@@ -1,4 +1,4 @@
-"""What holds for every game, with every argument."""
+"""Properties of every game, with every argument."""
 
 import copy
 import pickle
@@ -14,7 +14,7 @@ each_game = pytest.mark.parametrize("game", GAMES, ids=repr)
 
 
 @each_game
-def test_every_state_met_is_a_state(game: Game) -> None:
+def test_every_reachable_state_is_valid(game: Game) -> None:
     for obs in (start_states(game, 300), wandered_states(game, 300)):
         assert obs.dtype == np.int8
         assert obs.shape == (300, *game.observation_space.shape)
@@ -93,7 +93,7 @@ def test_goals_cannot_be_replaced_by_accident(game: Game) -> None:
 
 
 @pytest.mark.parametrize(("game", "score"), [(GeyserRunner(), 24.2), (Maneuverer(), 1.1), (FlierCatcher(), 12.75)], ids=repr)
-def test_random_play_scores_what_it_always_has(game: Game, score: float) -> None:
+def test_scores_of_random_play_have_not_changed(game: Game, score: float) -> None:
     earned = returns(game, None, game.reward, episodes=2000, seed=0)
     assert abs(earned.mean() - score) < 4 * earned.std() / np.sqrt(2000)
 

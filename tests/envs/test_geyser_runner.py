@@ -65,7 +65,7 @@ def test_reward_is_the_position_less_the_cost_of_a_hit() -> None:
     assert step(game, 8, 0, "right") == (9, 2, 1.0)
 
 
-def test_other_goals_mean_what_they_say() -> None:
+def test_other_goals_are_as_documented() -> None:
     game = GeyserRunner()
     at = np.array([state(game, p, 2) for p in (0, 4, 5, 6, 7, 8, 9)])  # the eruption is at column 7
     none = np.zeros(len(at), dtype=np.int64)
@@ -78,7 +78,7 @@ def test_other_goals_mean_what_they_say() -> None:
     assert game.reward_functions["spray"](edges, none[:6], edges).tolist() == [1, 1, 0, 1, 1, 0]
 
 
-def test_the_scene_shows_who_stands_where() -> None:
+def test_the_scene_shows_all_positions() -> None:
     game = GeyserRunner()
     kinds = [(s.kind, s.column) for s in game.scene(state(game, 2, 1)).sprites]
     assert ("player", 2) in kinds
@@ -104,7 +104,7 @@ def test_the_scene_shows_who_stands_where() -> None:
         ({"stay": 1}, TypeError, "stay must be True or False"),
     ],
 )
-def test_impossible_arguments_are_named(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
+def test_invalid_arguments_are_named(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         GeyserRunner(**arguments)
 

@@ -1,4 +1,4 @@
-"""Compiled functions work where nothing can be kept on disk, and one warning says so."""
+"""Compiled functions work, with one warning, if nothing can be cached on disk."""
 
 import os
 import shutil
@@ -24,8 +24,8 @@ def double(x):
 
 
 def run(package: str, installed: Path, cache: str) -> subprocess.CompletedProcess[str]:
-    """Imports a package and calls a compiled function in a process that finds no home folder to write to."""
-    # Nobody, not even root, can make a folder below a file, nor one of a name that a file has.
+    """Imports a package and calls a compiled function in a process without a writable home folder."""
+    # Not even root can create a folder below a file, or one with the name of a file.
     home = {"HOME": os.devnull, "XDG_CACHE_HOME": f"{os.devnull}/cache", "PYTHONPATH": str(installed), "NUMBA_CACHE_DIR": cache}
     code = f"import numpy, {package}; from mbagent_envs.random_keys import mix; print({package}.__file__, mix(numpy.uint64(1)))"
     command = [sys.executable, "-c", code]
@@ -34,7 +34,7 @@ def run(package: str, installed: Path, cache: str) -> subprocess.CompletedProces
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the packages in folders that no compiled function can be kept in."""
+    """A copy of the packages in folders in which no compiled function can be cached."""
     folder = tmp_path_factory.mktemp("installed")
     for package in (ROOT / "mbagent", ROOT / "envs" / "mbagent_envs"):
         shutil.copytree(package, folder / package.name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -44,7 +44,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(("package", "cache"), [("mbagent", ""), ("mbagent_envs", f"{os.devnull}/numba")])
-def test_packages_work_where_nothing_can_be_written_with_one_warning(installed: Path, package: str, cache: str) -> None:
+def test_packages_work_without_writable_folders_with_one_warning(installed: Path, package: str, cache: str) -> None:
     done = run(package, installed, cache)
     assert done.returncode == 0, done.stderr
     assert str(installed) in done.stdout
@@ -61,7 +61,7 @@ def test_a_writable_folder_for_numba_is_used_without_a_warning(installed: Path, 
 
 @pytest.fixture
 def double(tmp_path: Path) -> Iterator[Callable[[Any], Any]]:
-    """A compiled function in a folder of its own."""
+    """A compiled function in a separate folder."""
     (tmp_path / "doubling.py").write_text(DOUBLE)
     spec = util.spec_from_file_location("doubling", tmp_path / "doubling.py")
     assert spec is not None
@@ -73,7 +73,7 @@ def double(tmp_path: Path) -> Iterator[Callable[[Any], Any]]:
     jit._warn_uncached.cache_clear()
 
 
-def test_a_folder_that_cannot_be_written_to_any_more_stops_nothing(double: Callable[[Any], Any], tmp_path: Path) -> None:
+def test_a_folder_that_is_no_longer_writable_raises_no_error(double: Callable[[Any], Any], tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "__pycache__")
     (tmp_path / "__pycache__").write_text("")
     with pytest.warns(RuntimeWarning, match="NUMBA_CACHE_DIR"):
@@ -81,7 +81,7 @@ def test_a_folder_that_cannot_be_written_to_any_more_stops_nothing(double: Calla
     assert double(0.5) == 1.0  # no second warning
 
 
-def test_a_full_disk_stops_nothing(double: Callable[[Any], Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_raises_no_error(double: Callable[[Any], Any], monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*args: Any) -> None:
         raise OSError(28, "No space left on device")
 
@@ -90,7 +90,7 @@ def test_a_full_disk_stops_nothing(double: Callable[[Any], Any], monkeypatch: py
         assert double(2) == 4
 
 
-def test_damaged_files_stop_nothing(double: Callable[[Any], Any], tmp_path: Path) -> None:
+def test_damaged_files_raise_no_error(double: Callable[[Any], Any], tmp_path: Path) -> None:
     assert double(2) == 4
     (index,) = (tmp_path / "__pycache__").glob("*.nbi")
     index.write_bytes(b"")

@@ -55,11 +55,11 @@ def test_reward_is_standing_on_the_target_afterwards() -> None:
     action = np.array([1])
     assert game.reward(before[None], action, step(before, "right")[None]) == 1
     assert game.reward(before[None], action, step(before, "down")[None]) == 0
-    for key in range(50):  # the redraw puts the target elsewhere
+    for key in range(50):  # the new layout has the target elsewhere
         assert game.reward(on[None], action, step(on, "right", key)[None]) == 0
 
 
-def test_leaving_the_target_redraws_around_the_player_whatever_the_action() -> None:
+def test_a_step_from_the_target_draws_a_new_layout_for_any_action() -> None:
     on = board("....", "..&.", "....", "....")
     for action, key in product(("up", "right", "down", "left"), range(20)):
         after = step(on, action, key)
@@ -80,7 +80,7 @@ def test_the_target_is_another_cell_that_can_be_reached(game: Maneuverer) -> Non
 @pytest.mark.parametrize("density", [0.0, 0.2, 0.6, 0.95])
 @pytest.mark.parametrize("player", [(0, 0), (1, 1), (0, 1)])
 def test_layouts_have_the_distribution_of_drawing_again(density: float, player: tuple[int, int]) -> None:
-    """Enumerate 3 x 3 boards, keep those with a cell in reach, share each among its targets, compare."""
+    """Enumerate 3 x 3 boards with a reachable cell, divide the weight of each among its targets, and compare."""
     size, n = 3, 60_000
     others = [cell for cell in product(range(size), repeat=2) if cell != player]
     exact: dict[bytes, float] = {}
@@ -118,11 +118,11 @@ def test_players_start_anywhere() -> None:
 def test_almost_full_boards_are_drawn_at_once() -> None:
     game = Maneuverer(size=8, wall_density=1 - 1e-12)
     obs = start_states(game, 1000)
-    assert (obs[:, 1].sum(axis=(1, 2)) == 8 * 8 - 2).all()  # the player, and one cell beside him
+    assert (obs[:, 1].sum(axis=(1, 2)) == 8 * 8 - 2).all()  # the player, and one adjacent cell
     game.check_observations(obs)
 
 
-def test_other_goals_mean_what_they_say() -> None:
+def test_other_goals_are_as_documented() -> None:
     game = Maneuverer(size=3)
     boards = np.array(
         [
@@ -142,7 +142,7 @@ def test_other_goals_mean_what_they_say() -> None:
     assert goals["nook"] == [1, 0, 0, 1, 0]
 
 
-def test_what_cannot_be_listed_says_so() -> None:
+def test_too_many_successors_raise_an_error() -> None:
     with pytest.raises(NotImplementedError, match="too many to list; sample them with transition"):
         Maneuverer(size=3).transition_distribution(board("&..", "...", "..."), 0)
 
@@ -161,7 +161,7 @@ def test_what_cannot_be_listed_says_so() -> None:
         ({"wall_density": False}, TypeError, "wall_density must be a number"),
     ],
 )
-def test_impossible_arguments_are_named(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
+def test_invalid_arguments_are_named(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         Maneuverer(**arguments)
 
@@ -174,7 +174,7 @@ def test_impossible_arguments_are_named(arguments: dict[str, Any], error: type[E
         (("@#*", "##.", "..."), "the player must be able to reach the target"),
     ],
 )
-def test_broken_boards_are_no_states(rows: tuple[str, ...], message: str) -> None:
+def test_invalid_boards_are_refused(rows: tuple[str, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Maneuverer(size=3).check_observations(board(*rows)[None])
 

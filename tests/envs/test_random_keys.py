@@ -6,7 +6,7 @@ from mbagent_envs.random_keys import derive, derive_one, draw_keys, uniform_at, 
 EXPECTED_UNIFORMS = [[0.8833108082136426, 0.43152799704850997], [0.7497482413580301, 0.37239342287916577]]
 
 
-def test_numbers_are_uniform_whatever_the_keys() -> None:
+def test_numbers_are_uniform_for_any_keys() -> None:
     spread = np.random.default_rng(0).integers(0, 2**64, size=20_000, dtype=np.uint64)
     for keys in (np.arange(20_000), np.arange(20_000) << 40, spread):
         drawn = uniforms(keys, 4)
@@ -15,7 +15,7 @@ def test_numbers_are_uniform_whatever_the_keys() -> None:
         assert drawn.max() < 1
         counts = np.array([np.histogram(column, bins=20, range=(0, 1))[0] for column in drawn.T])
         chi_square = ((counts - 1000) ** 2 / 1000).sum(axis=1)
-        assert (chi_square < 50).all()  # 19 degrees of freedom: 50 is passed once in 7,000 times
+        assert (chi_square < 50).all()  # 19 degrees of freedom: 50 is exceeded with probability 1/7,000
         assert np.abs(np.corrcoef(drawn.T) - np.eye(4)).max() < 0.03  # columns independent
         assert abs(np.corrcoef(drawn[:-1, 0], drawn[1:, 0])[0, 1]) < 0.03  # so are neighbouring keys
 
@@ -35,7 +35,7 @@ def test_compiled_code_draws_the_same() -> None:
     assert [derive_one(key, np.uint64(9)) for key in keys] == derive(keys, 9).tolist()
 
 
-def test_the_numbers_never_change() -> None:  # recorded seeds must keep their meaning from release to release
+def test_the_numbers_never_change() -> None:  # recorded seeds must keep their meaning across releases
     np.testing.assert_array_equal(derive(0, 1, 2), np.array([6471287870292904291], dtype=np.uint64))
     np.testing.assert_array_equal(uniforms([0, 1], 2), EXPECTED_UNIFORMS)
 

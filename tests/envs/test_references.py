@@ -41,7 +41,7 @@ def test_every_goal_separates_good_play_from_random_play(game: Game, name: str) 
     assert good.mean() - random.mean() > 10 * error
 
 
-def test_stochastic_geysers_are_braved_when_cheap_and_shunned_when_dear() -> None:
+def test_stochastic_geysers_are_crossed_only_at_a_low_cost() -> None:
     for cost, resting in ((1.0, 9), (25 / 9 - 0.1, 9), (25 / 9 + 0.1, 4), (5.0, 4)):
         game = GeyserRunner(hit_cost=cost)
         policy = reference_policy(game, gamma=0.999)
@@ -56,7 +56,7 @@ def test_stochastic_geysers_are_braved_when_cheap_and_shunned_when_dear() -> Non
             assert position == resting
 
 
-def test_deterministic_geysers_are_passed_unhurt() -> None:
+def test_deterministic_geysers_are_passed_without_a_hit() -> None:
     game = GeyserRunner(mode="deterministic", hit_cost=100.0)
     policy = reference_policy(game)
     assert policy is not None
@@ -89,7 +89,7 @@ def distances(obs: Bits) -> Ints:
 
 
 @pytest.mark.parametrize("game", [Maneuverer(), Maneuverer(size=8, wall_density=0.35)], ids=repr)
-def test_maneuverer_always_comes_one_step_nearer(game: Maneuverer) -> None:
+def test_maneuverer_always_approaches_the_target(game: Maneuverer) -> None:
     policy = reference_policy(game)
     assert policy is not None
     states = wandered_states(game, 200)
@@ -100,10 +100,10 @@ def test_maneuverer_always_comes_one_step_nearer(game: Maneuverer) -> None:
         assert steps[next_obs[0] == 1] == steps[obs[0] == 1] - 1
 
 
-def test_maneuverer_redraws_when_the_goal_is_out_of_reach() -> None:
+def test_maneuverer_seeks_a_new_layout_if_the_goal_is_unreachable() -> None:
     policy = reference_policy(Maneuverer(size=3), "corner")
     assert policy is not None
-    assert policy(board("#..", "@..", "*..")[None]).tolist() == [2]  # the corner is a wall: only a redraw helps
+    assert policy(board("#..", "@..", "*..")[None]).tolist() == [2]  # the corner is a wall, so a new layout is needed
     assert policy(board("...", "@..", "*..")[None]).tolist() == [0]
 
 
@@ -111,8 +111,8 @@ def test_flier_catcher_takes_the_path_with_more_fliers() -> None:
     game = FlierCatcher(height=5, width=6)
     obs = np.zeros((1, 2, 5, 6), dtype=np.int8)
     obs[0, 0, 2, 0] = 1
-    obs[0, 1, 0, 4] = 1  # one above, in reach
-    obs[0, 1, 4, 2] = obs[0, 1, 4, 3] = 1  # two below, in reach, but not after the one above
+    obs[0, 1, 0, 4] = 1  # one above, reachable
+    obs[0, 1, 4, 2] = obs[0, 1, 4, 3] = 1  # two below, reachable, but not after the one above
     for name, action in (("default", 2), ("catch low", 2), ("top row", 0)):
         policy = reference_policy(game, name)
         assert policy is not None
@@ -132,7 +132,7 @@ def test_every_game_and_goal_has_a_reference_that_does_not_depend_on_the_batch(g
 
 
 @pytest.mark.parametrize("game", DEFAULTS, ids=repr)
-def test_goals_of_ones_own_are_solved_too(game: Game) -> None:
+def test_custom_goals_are_solved_too(game: Game) -> None:
     last: RewardFn = lambda obs, action, next_obs: (action == 1).astype(np.float64)  # noqa: E731
     policy = reference_policy(game, last)
     assert policy is not None

@@ -9,7 +9,7 @@ import mbagent_envs
 
 
 @pytest.mark.parametrize("env_id", mbagent_envs.ENV_IDS)
-def test_registering_again_changes_and_says_nothing(env_id: str) -> None:
+def test_registering_again_changes_nothing_without_a_warning(env_id: str) -> None:
     before = gym.spec(env_id)
     mbagent_envs.register_envs()
     importlib.reload(mbagent_envs)

@@ -67,7 +67,7 @@ def test_the_default_is_next_step_and_the_games_own_length() -> None:
     assert own.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     own.reset(seed=0)
     ends = [own.step(np.zeros(2, dtype=np.int64))[3].tolist() for _ in range(202)]
-    assert [t + 1 for t, end in enumerate(ends) if end[0]] == [100, 201]  # one call of each 101 is the reset
+    assert [t + 1 for t, end in enumerate(ends) if end[0]] == [100, 201]  # one call of every 101 is the reset
     endless = gym.make_vec("mbagent/Maneuverer-v0", num_envs=2, max_episode_steps=-1)
     endless.reset(seed=0)
     assert not any(endless.step(np.zeros(2, dtype=np.int64))[3].any() for _ in range(150))
@@ -118,7 +118,7 @@ def test_copies_may_start_from_given_states(env_id: str) -> None:
         own.reset(options={"state": states[:2]})
     with pytest.raises(ValueError, match="not a state of"):
         own.reset(options={"state": np.zeros_like(states)})
-    with pytest.raises(ValueError, match="reset knows no option 'bogus'; its options are 'state', 'reset_mask'"):
+    with pytest.raises(ValueError, match="reset has no option 'bogus'; its options are 'state', 'reset_mask'"):
         own.reset(options={"bogus": 1})
     with pytest.raises(ValueError, match="reset_mask"):
         own.reset(options={"reset_mask": np.zeros(3, dtype=np.bool_)})

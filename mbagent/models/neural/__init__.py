@@ -1,4 +1,4 @@
-"""The networks of the paper's section 3, their training, pruning and compiled inference."""
+"""The networks of the paper's section 3: training, pruning and compiled inference."""
 
 from mbagent.models.neural.model import NeuralTransitionModel
 

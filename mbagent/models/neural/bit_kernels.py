@@ -1,8 +1,8 @@
-"""Predictor and causal conditioner of a world of bits in compiled search, evaluated for all actions of a state.
+"""Predictor and causal conditioner of binary variables in compiled search, evaluated for all actions of a state.
 
-The first layers' sums over the state are shared by all actions. The predictor's certain bits are decided by their logits alone;
-only the others are conditioned, particle by particle (see ``systematic_sampling.py``). Sums have another order than in
-``kernels.py``, and the exponential is exact to single precision: results are equal up to rounding.
+The first layers' sums over the state are shared by all actions. Bits of which the predictor is certain are determined by its
+logits; only the others are conditioned, for each particle (see ``systematic_sampling.py``). Sums have another order than in
+``kernels.py``, and the exponential is exact to single precision, so results are equal up to rounding.
 Shapes: F bits of a state, O = F + 1 of an outcome (``terminated`` last), C >= O columns, A actions, H hidden nodes of the
 predictor, g groups of G hidden nodes in the conditioner.
 """
@@ -35,10 +35,10 @@ from mbagent.types import Ints
 from mbagent_envs.jit import compiled, inlined
 
 BIT_LANES = 16
-"""Columns are filled up to a multiple of this many numbers, which a processor adds at once."""
+"""Columns are padded to a multiple of this number, for vector instructions."""
 
 _LOG2E, _BIT_LN2_HIGH, _BIT_LN2_LOW = np.float32(1.44269504), np.float32(0.693359375), np.float32(-2.12194440e-4)
-_ROUND = np.float32(12582912.0)  # 1.5 * 2**23: a small number added to it is rounded to a whole one
+_ROUND = np.float32(12582912.0)  # 1.5 * 2**23: adding it rounds a small number to an integer
 _C5, _C4, _C3 = np.float32(1.9875691500e-4), np.float32(1.3981999507e-3), np.float32(8.3334519073e-3)
 _C2, _C1, _C0 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1), np.float32(5.0000001201e-1)
 _BIT_ONE, _BIT_TWO, _MOST = np.float32(1.0), np.float32(2.0), np.float32(80.0)
@@ -52,16 +52,16 @@ class CausalBits(NamedTuple):
         bias: [H].
         last: from hidden nodes to the outcome's bits, [H, C].
         last_bias: [C].
-        stay: the residual path's, [A, C].
-        activation: of all hidden nodes; see ``kernels``.
-        group_of: group of each outcome bit, -1 where it has none, int64 [O].
+        stay: weights of the residual path, [A, C].
+        activation: code of the activation of all hidden nodes; see ``kernels``.
+        group_of: group of each outcome bit, -1 if it has none, int64 [O].
         inputs: from state bits and actions to the groups, [F + A, g, G].
         others: from outcome bits to the groups, zero where pruned, [g, O, G].
         group_bias: [g, G].
         readout: [g, G].
         offset: [g].
         correction: whether the predictor's logits are added to the conditioner's.
-        certain: a bit whose logit is at least this far from 0 is left to the predictor.
+        certain: a bit whose logit has at least this absolute value is sampled from the predictor.
     """
 
     first: Floats32
@@ -81,9 +81,9 @@ class CausalBits(NamedTuple):
 
 
 def pack_bits(dense: DenseWeights, group: GroupWeights, layout: Layout, certain: float) -> CausalBits | None:
-    """The kernel of packed networks; None where there is something that it does not cover.
+    """The kernel of packed networks; None if they are not supported.
 
-    It covers states of bits, one hidden layer, and actions of a single step.
+    Supported are states of bits, one hidden layer, and actions of a single step.
     """
     if (layout.outputs != 2).any() or len(dense.sizes) != 1 or layout.n_steps != 1:
         return None
@@ -110,7 +110,7 @@ def pack_bits(dense: DenseWeights, group: GroupWeights, layout: Layout, certain:
 
 @inlined
 def _exp(x: np.float32) -> np.float32:
-    """exp(x) for -80 <= x <= 80, so written that a loop over it takes many numbers at once (Moshier's Cephes, expf)."""
+    """exp(x) for -80 <= x <= 80, written so that loops over it can be vectorised (Moshier's Cephes, expf)."""
     shifted = x * _LOG2E + _ROUND
     whole = shifted - _ROUND
     rest = x - whole * _BIT_LN2_HIGH - whole * _BIT_LN2_LOW
@@ -121,7 +121,7 @@ def _exp(x: np.float32) -> np.float32:
 
 @inlined
 def _gate(x: np.float32) -> np.float32:
-    """The logistic function. ``np.divide`` asks for no error at 0, which would keep a loop from taking many numbers at once."""
+    """The logistic function. ``np.divide`` does not check for division by 0, a check that would prevent vectorisation."""
     gate: np.float32 = np.divide(_BIT_ONE, _BIT_ONE + _exp(min(max(-x, -_MOST), _MOST)))
     return gate
 
@@ -157,7 +157,7 @@ def predict(
     hidden: Floats32,
     logits: Floats32,
 ) -> None:
-    """Writes the predictor's logits [C] of a state, given what its bits add to the first layer, and an action."""
+    """Writes the predictor's logits [C] for an action, given the state's contribution ``sums`` to the first layer."""
     for h in range(len(hidden)):
         hidden[h] = sums[h] + first[n_bits + action, h]
     activate(hidden, code)
@@ -191,7 +191,7 @@ def known_sum(
     ready: Ints,
     known: Floats32,
 ) -> None:
-    """Writes what a group gets from state, action, and the settled bits; bits that it may not see have weight 0."""
+    """Writes a group's input from state, action and settled outcome bits; bits hidden from it have weight 0."""
     if ready[g] == 0:
         for h in range(len(known)):
             state_sums[g, h] = group_bias[g, h]
@@ -221,7 +221,7 @@ def condition(
     group: Floats32,
     factors: Ints,
 ) -> float:
-    """The logit of open bit w in the eyes of its group g, which particle q shows its open bits so far."""
+    """The logit of open bit w by its group g, given the earlier open bits of particle q."""
     size = len(known)
     for h in range(size):
         group[h] = known[h]
@@ -230,7 +230,7 @@ def condition(
             for h in range(size):
                 group[h] += others[g, still_open[v], h]
     activate(group, code)
-    s0 = s1 = s2 = s3 = np.float32(0.0)  # four sums, none of which waits for the others
+    s0 = s1 = s2 = s3 = np.float32(0.0)  # four independent sums, for instruction-level parallelism
     for h in range(0, size - 3, 4):
         s0 += group[h] * readout[g, h]
         s1 += group[h + 1] * readout[g, h + 1]
@@ -242,7 +242,7 @@ def condition(
 
 
 CERTAIN_LOGIT = math.log(1.0 / NEGLIGIBLE)
-"""A bit whose logit is further from 0 has only one value worth drawing."""
+"""If a bit's logit has a larger absolute value, its less likely value has negligible probability."""
 
 
 class BitsWork(NamedTuple):
@@ -250,14 +250,14 @@ class BitsWork(NamedTuple):
 
     Attributes:
         on: state bits that are 1, int64 [F].
-        sums: what the state gives to the first layer, [H].
+        sums: the state's contribution to the first layer, [H].
         hidden: [H].
         logits: the predictor's, [C].
-        state_sums: what the state gives to each group, [g, G].
-        ready: whether it is there, int64 [g].
-        known: what a group gets whatever the particle, [G].
+        state_sums: the state's contribution to each group, [g, G].
+        ready: whether it has been computed, int64 [g].
+        known: the part of a group's input that all particles share, [G].
         group: its hidden nodes, [G].
-        base: the outcome but for its open bits, int64 [O].
+        base: the outcome without its open bits, int64 [O].
         open: bits that are not settled, int64 [O].
         shown: settled outcome bits that are 1, int64 [O].
         p: particles.
@@ -280,7 +280,7 @@ class BitsWork(NamedTuple):
 @implements(work_for, CausalBits)
 @compiled
 def bits_work(k: CausalBits, n_grid: int) -> BitsWork:
-    """See compiled_model."""
+    """See ``models.overloads``."""
     n_outputs, n_hidden = len(k.group_of), len(k.bias)
     n_groups, size = k.group_bias.shape
     return BitsWork(
@@ -301,7 +301,7 @@ def bits_work(k: CausalBits, n_grid: int) -> BitsWork:
 
 @inlined
 def _chance(logit: float) -> float:
-    """Probability of a bit, pruned as ``particles.prune`` does."""
+    """Probability of a bit, pruned as by ``systematic_sampling.prune``."""
     if logit > CERTAIN_LOGIT:
         return 1.0
     if logit < -CERTAIN_LOGIT:
@@ -311,7 +311,7 @@ def _chance(logit: float) -> float:
 
 @inlined
 def settled_chance(one: float) -> float:
-    """Probability ``one`` of a bit, pruned as ``particles.prune`` does."""
+    """Probability ``one`` of a bit, pruned as by ``systematic_sampling.prune``."""
     if one < NEGLIGIBLE * (1.0 - one):
         return 0.0
     if 1.0 - one < NEGLIGIBLE * one:
@@ -321,7 +321,7 @@ def settled_chance(one: float) -> float:
 
 @inlined
 def _settle(logits: Floats32, group_of: Ints, certain: float, base: Ints, still_open: Ints, shown: Ints) -> tuple[int, int]:
-    """Writes the settled bits to ``base``; returns how many are open, and how many of the settled ones are 1."""
+    """Writes the settled bits to ``base``; returns the number of open bits, and of settled bits that are 1."""
     n_open, n_shown = 0, 0
     for i in range(len(base)):
         distance = abs(np.float64(logits[i]))
@@ -339,7 +339,7 @@ def _settle(logits: Floats32, group_of: Ints, certain: float, base: Ints, still_
 
 @inlined
 def write_outcomes(total: int, base: Ints, still_open: Ints, p: Particles, n_grid: int, out: Outcomes) -> int:
-    """Writes the outcomes of an action from number ``total`` on, with their probabilities; returns their number."""
+    """Writes the outcomes of an action with their probabilities, from index ``total``; returns their number."""
     weigh(p, n_grid)
     for i in range(n_outcomes(p)):
         slot = slot_of(p, i, n_grid)
@@ -355,7 +355,7 @@ def write_outcomes(total: int, base: Ints, still_open: Ints, p: Particles, n_gri
 @implements(outcomes, CausalBits)
 @compiled
 def bits_outcomes(k: CausalBits, work: BitsWork, state: Ints, n_grid: int, key: np.uint64, offset: float, out: Outcomes) -> int:
-    """See compiled_model."""
+    """See ``models.overloads``."""
     grid, total, n_on, n_bits, n_actions = (n_grid, key, offset), 0, 0, len(state), len(k.stay)
     first, last, last_bias, stay = k.first, k.last, k.last_bias, k.stay
     group_of, inputs, others, group_bias = k.group_of, k.inputs, k.others, k.group_bias

@@ -1,7 +1,7 @@
-"""Pruning (paper section 5): the smallest weights go, a few at a time, while what is left is trained on.
+"""Pruning by magnitude (paper section 5): the smallest weights are removed gradually, while the others are trained.
 
-The paper prunes once and retrains; going gradually, as here by default, loses less (Zhu and Gupta 2017, "To prune, or not to
-prune", whose schedule this is). A weight that is gone is exactly 0 and stays so.
+The paper prunes once and retrains; gradual removal, the default here, loses less accuracy (the schedule is that of Zhu and Gupta
+2017, "To prune, or not to prune"). A removed weight is exactly 0 and remains 0.
 """
 
 from __future__ import annotations
@@ -37,13 +37,12 @@ class PruningConfig:
     """How a network is pruned.
 
     Attributes:
-        gradual: whether connections go a few at a time while training; False: all at once, then training (the paper).
-        removal: share of the training during which connections go.
-        steps: how often some go in that time.
-        shrink: how strongly all weights are drawn to 0 in that time, so that what is of no use becomes small (the weight of the
-            sum of absolute values in the loss); nothing draws afterwards.
-        evidence: whether connections that the transitions do not call for go, too, at whatever share (see ``evidence``); False:
-            just the smallest ones. Weights shared over positions are not looked at.
+        gradual: whether connections are removed gradually during training; False: all at once before training (the paper).
+        removal: share of the training during which connections are removed.
+        steps: number of removals in that time.
+        shrink: weight of an L1 penalty in the loss during that time, which makes useless weights small.
+        evidence: whether connections that the transitions do not support are removed as well, beyond the given share (see
+            ``pruning``); False: only the smallest ones. Weights shared over positions are not examined.
     """
 
     gradual: bool = True
@@ -54,11 +53,11 @@ class PruningConfig:
 
 
 class Connections:
-    """The weights of a network that stand for connections, and which of them are left.
+    """The weights of a network that are connections, and which of them remain.
 
     Args:
-        module: the network; its biases are no connections, nor is what its own masks never let through.
-        zeros_gone: whether weights that are exactly 0 are connections that are gone.
+        module: the network; biases and weights that its own masks disable are not connections.
+        zeros_gone: whether weights that are exactly 0 are removed connections.
     """
 
     def __init__(self, module: nn.Module, zeros_gone: bool = False) -> None:
@@ -71,12 +70,12 @@ class Connections:
 
     @property
     def left(self) -> int:
-        """How many are left."""
+        """Number of remaining connections."""
         return sum(int(mask.sum()) for mask in self.kept.values())
 
     @torch.no_grad()
     def drop(self, fraction: float) -> None:
-        """Removes the smallest weights by absolute value until this share of all is gone; those gone before stay gone."""
+        """Removes the smallest weights by absolute value until this share is removed; includes those removed before."""
         stay = self.total - round(fraction * self.total)
         sizes = torch.cat([p.abs()[self.kept[name]] for name, p in self.weights.items()])
         if len(sizes) <= stay or stay < 1:
@@ -87,51 +86,51 @@ class Connections:
 
     @torch.no_grad()
     def apply(self) -> None:
-        """Sets the weights of all connections that are gone to 0."""
+        """Sets the weights of all removed connections to 0."""
         for name, p in self.weights.items():
             p.mul_(self.kept[name])
 
 
 class Shrinking:
-    """What ``Trainer`` does to a network's connections while it trains.
+    """Removal of a network's connections during training by ``Trainer``.
 
     Args:
-        connections: of the network.
-        fraction: the share that is to be gone in the end.
+        connections: connections of the network.
+        fraction: the share to be removed by the end.
         config: see PruningConfig.
     """
 
     def __init__(self, connections: Connections, fraction: float, config: PruningConfig) -> None:
         self.connections, self.config = connections, config
-        self._begun = 1.0 - connections.left / max(connections.total, 1)
-        self.fraction = max(fraction, self._begun)  # what is gone stays gone
+        self._removed_before = 1.0 - connections.left / max(connections.total, 1)
+        self.fraction = max(fraction, self._removed_before)  # removed connections remain removed
         self._done = 0
         if not config.gradual:
             connections.drop(fraction)
 
     @property
     def finished(self) -> bool:
-        """Whether all that is to go is gone."""
+        """Whether the requested share has been removed."""
         return not self.config.gradual or self._done >= self.config.steps
 
     def penalty(self) -> Tensor | float:
-        """What is added to the loss."""
+        """The penalty added to the loss."""
         if self.finished or self.config.shrink == 0.0:
             return 0.0
         return self.config.shrink * torch.stack([p.abs().sum() for p in self.connections.weights.values()]).sum()
 
     def after_step(self, share: float) -> None:
-        """Called after a gradient step, ``share`` of the training done."""
+        """Called after a gradient step, when ``share`` of the training is completed."""
         due = math.floor(self.config.steps * min(share / self.config.removal, 1.0))
         if self.config.gradual and due > self._done:
             self._done = due
             left = (1.0 - due / self.config.steps) ** 3
-            self.connections.drop(self.fraction + (self._begun - self.fraction) * left)
+            self.connections.drop(self.fraction + (self._removed_before - self.fraction) * left)
         self.connections.apply()
 
 
 def _possible(module: nn.Module, name: str, weight: nn.Parameter) -> Tensor:
-    """Which of a weight's numbers the module's own mask lets through, bool."""
+    """Mask of the weights that the module's own mask enables, bool."""
     owner = module.get_submodule(name.rpartition(".")[0])
     mask = getattr(owner, "mask", None)
     return torch.ones_like(weight, dtype=torch.bool) if mask is None else mask.clone()
@@ -150,7 +149,7 @@ class PrunableModel(Protocol):
         progress: Callable[[float], None] | None = None,
         config: PruningConfig | None = None,
     ) -> FitReport:
-        """Removes connections and trains what is left; leaves the model as it was where that fails."""
+        """Removes connections and trains the remaining ones; if that fails, the model is unchanged."""
         ...
 
 
@@ -158,24 +157,24 @@ def prunable(model: TransitionModel, fitted: bool, n_transitions: int) -> Prunab
     """The model, if it can be pruned now.
 
     Args:
-        model: any.
-        fitted: whether it is.
-        n_transitions: transitions to train the remaining connections on.
+        model: any transition model.
+        fitted: whether it is fitted.
+        n_transitions: number of transitions for training the remaining connections.
 
     Raises:
-        TypeError: it has no weights; the message says what to do.
+        TypeError: the model has no weights; the message suggests a solution.
         ValueError: nothing is learned yet, or there are no transitions.
     """
     if not isinstance(model, PrunableModel):
         raise TypeError(
-            f"This agent's model, {type(model).__name__}, has no connections to prune: decision graphs and tables hold only what "
-            "the data called for. Learn with model='networks' or model='paper' to prune networks."
+            f"This agent's model, {type(model).__name__}, has no connections to prune: decision graphs and tables contain only "
+            "dependencies that the data support. Learn with model='networks' or model='paper' to prune networks."
         )
     if not fitted:
         raise ValueError("There is nothing to prune yet: call learn() first.")
     if not n_transitions:
         raise ValueError(
-            "prune() trains what is left on the transitions met, and this agent has none: give it some with "
+            "prune() trains the remaining connections on observed transitions, and this agent has none: give it some with "
             "load_transitions(path), or save agents with include=['transitions']."
         )
     return model

@@ -1,4 +1,4 @@
-"""From torch modules to the plain arrays that the compiled kernels read."""
+"""Conversion of torch modules to the plain arrays of the compiled kernels."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ CompiledBody: TypeAlias = Callable[[States, Actions], Floats32]
 """(states int64 [B, F], actions int64 [B]) -> logits float32 [B, O, K]; a row's result does not depend on its batch."""
 
 ROWS_PER_CHUNK = 64
-"""Rows that other torch bodies are evaluated on at once, always this many: matrix products round differently in
-other sizes."""
+"""Rows per evaluation of torch bodies without a kernel; always this number, since matrix products round differently in other
+sizes."""
 
 
 LANES = 16
-"""Hidden layers are as wide as a multiple of this: what the processor adds at once. The rest is zero and leads nowhere."""
+"""Hidden layers are padded with zeros to a multiple of this, for vector instructions."""
 
 
 def compiled_body(predictor: nn.Module, layout: Layout) -> CompiledBody:
-    """A predictor with its present weights, for inference: compiled where there is a kernel for it, else by torch."""
+    """A predictor with its present weights, for inference: compiled if there is a kernel for it, else by torch."""
     if isinstance(predictor, DensePredictor):
         dense = pack_dense(predictor)
         return lambda states, actions: dense_logits(states, actions, layout, dense)
@@ -52,7 +52,7 @@ def in_chunks(predictor: nn.Module, states: States, actions: Actions) -> Floats3
 
 
 def pack_layout(codec: FactorCodec) -> Layout:
-    """Where the codec's factors lie among its columns."""
+    """Layout of the codec's factors among its columns."""
     factor = codec.column_factor.numpy()
     start = np.searchsorted(factor, np.arange(len(codec.outputs))).astype(np.int64)
     return Layout(np.asarray(codec.outputs, dtype=np.int64), start, codec.n_state_columns, codec.n_actions, codec.n_steps)
@@ -98,7 +98,7 @@ def _padded(size: int, multiple: int) -> int:
 
 
 def pack_groups(conditioner: Conditioner) -> GroupWeights:
-    """A conditioner's weights, group by group."""
+    """A conditioner's weights by group."""
     codec, size = conditioner.codec, conditioner.group_size
     n_groups, mask, members = len(conditioner.members), conditioner.groups.mask, conditioner.members.numpy()
     index = np.full(len(codec.outputs), -1, dtype=np.int64)
@@ -137,7 +137,7 @@ def _array(tensor: Tensor) -> Floats32:
 
 
 def as_rows(states: States, actions: Actions, n_factors: int) -> tuple[States, Actions]:
-    """Both as contiguous int64, the one form that the compiled kernels take, which look at no shape."""
+    """Both as contiguous int64, as required by the compiled kernels, which do not check shapes."""
     states, actions = np.ascontiguousarray(states, dtype=np.int64), np.ascontiguousarray(actions, dtype=np.int64)
     if states.ndim != 2 or states.shape[1] != n_factors or actions.shape != (len(states),):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Forecasts some steps ahead (paper 4.2): the one-step model iterated, or a model of its own for each number of steps.
+"""Forecasts several steps ahead (paper 4.2): by iterating the one-step model, or by a separate model for each number of steps.
 
 "One alternative, if the agent wants to plan n steps in advance, is to learn a model for transition probabilities between
 states separated by n steps given a string of n actions. [...] it can use several separate models corresponding to each
@@ -25,11 +25,11 @@ ModelBuilder: TypeAlias = Callable[[int], BaseTransitionModel]
 """``build(n)``: an unfitted model whose action is a string of n actions, numbered as ``number_strings`` does."""
 
 _REST = 1 << 32
-"""Salt of the random numbers of steps after a direct forecast: no number of steps is as large."""
+"""Salt of the random numbers of steps after a direct forecast; larger than any number of steps."""
 
 
 def iterate(model: TransitionModel, states: States, strings: Actions, rng: Randomness) -> tuple[States, Bools]:
-    """A draw of where each string of actions leads, step by step; a terminated row stays where it ended.
+    """Samples the state after each string of actions, step by step; a terminated row keeps its last state.
 
     Args:
         model: the one-step model.
@@ -51,10 +51,10 @@ def iterate(model: TransitionModel, states: States, strings: Actions, rng: Rando
 
 
 def number_strings(strings: Actions, n_actions: int) -> Actions:
-    """Number of each string int64 [B, n]: its digits in base ``n_actions``, the first action lowest. Int64 [B].
+    """Number int64 [B] of each string int64 [B, n], whose digits in base ``n_actions`` are the actions, the first one lowest.
 
     Raises:
-        ValueError: the strings are too long to be numbered, or an action does not exist.
+        ValueError: the strings are too long to be numbered, or an action is out of range.
     """
     n = strings.shape[1]
     if strings.size and not (strings.min() >= 0 and strings.max() < n_actions):
@@ -69,7 +69,7 @@ def number_strings(strings: Actions, n_actions: int) -> Actions:
 
 
 def longest_string(n_actions: int) -> int:
-    """The longest string that can be numbered."""
+    """Length of the longest strings that can be numbered."""
     n = 1
     while n_actions > 1 and n_actions ** (n + 1) <= LARGEST_NUMBER:
         n += 1
@@ -79,14 +79,14 @@ def longest_string(n_actions: int) -> int:
 def steps_apart(data: TransitionDataset, n: int, seed: int = 0) -> TransitionDataset:
     """The transitions between states ``n`` steps apart, with the strings of actions between them as actions.
 
-    An episode that terminates within the string stays in its last state; the actions left over are random. Where
-    an episode was cut off, the string is left out; and where the longest episode was cut off, so are all strings that start
-    too near to that limit, ended or not: to keep only those that ended would make ends look likelier than they are.
+    An episode that terminates within the string stays in its last state; the remaining actions are random. Strings beyond
+    the end of a truncated episode are omitted; and if the longest episode was truncated, so are all strings that start less
+    than n steps before that limit: keeping only the terminated ones would overestimate the probability of termination.
 
     Args:
-        data: transitions of single steps, in the order met within each episode.
+        data: transitions of single steps, in the observed order within each episode.
         n: steps, at least 1.
-        seed: of the actions after an end.
+        seed: seed of the actions after termination.
 
     Raises:
         ValueError: n is below 1.
@@ -106,9 +106,9 @@ def steps_apart(data: TransitionDataset, n: int, seed: int = 0) -> TransitionDat
         if step:
             follows &= (rows.episodes[here] == rows.episodes[start]) & (rows.states[here] == rows.next_states[last]).all(axis=1)
         whole &= follows | over
-        going = whole & ~over
-        strings[going, step], last[going] = rows.actions[here[going]], here[going]
-        over[going] = rows.terminated[last[going]]
+        continues = whole & ~over
+        strings[continues, step], last[continues] = rows.actions[here[continues]], here[continues]
+        over[continues] = rows.terminated[last[continues]]
     whole &= _far_from_limit(rows, n)
     first, end = start[whole], last[whole]
     result.append(
@@ -125,7 +125,7 @@ def steps_apart(data: TransitionDataset, n: int, seed: int = 0) -> TransitionDat
 
 
 def _far_from_limit(rows: TransitionBatch, n: int) -> Bools:
-    """Which rows, in the order of their episodes, lie at least ``n`` steps before the limit on the length of episodes."""
+    """Mask of the rows, ordered by episode, that are at least ``n`` steps before the limit on the length of episodes."""
     if len(rows) == 0:
         return np.zeros(0, dtype=np.bool_)
     _, first, lengths = np.unique(rows.episodes, return_index=True, return_counts=True)
@@ -136,25 +136,25 @@ def _far_from_limit(rows: TransitionBatch, n: int) -> Bools:
 
 
 class DirectForecastModel(BaseTransitionModel):
-    """A one-step model, and beside it one model for each of several numbers of steps.
+    """A one-step model and separate models of several steps.
 
-    As a transition model it is its one-step model, so every planner works on it. ``forecast`` uses the others: errors
-    do not accumulate over steps, but a model of many steps is harder to learn.
+    As a transition model it behaves as its one-step model, so every planner can use it. ``forecast`` uses the other models:
+    their errors do not accumulate over steps, but a model of many steps is harder to learn.
 
     Args:
         one_step: the one-step model.
         build: builds the model of n steps.
-        steps: the numbers of steps with a model of their own, each at least 2.
+        steps: the numbers of steps with a separate model, each at least 2.
 
     Raises:
-        ValueError: a number of steps below 2, or strings of so many actions cannot be numbered.
+        ValueError: a number of steps is below 2, or too large for numbering the strings of actions.
     """
 
     def __init__(self, one_step: BaseTransitionModel, build: ModelBuilder, steps: tuple[int, ...]) -> None:
         """See the class."""
         super().__init__(one_step.cardinalities, one_step.n_actions)
         if any(n < 2 for n in steps):
-            raise ValueError(f"Numbers of steps with a model of their own must be 2 or more, got {sorted(steps)}.")
+            raise ValueError(f"Numbers of steps with a separate model must be 2 or more, got {sorted(steps)}.")
         limit = longest_string(self.n_actions)
         if any(n > limit for n in steps):
             raise ValueError(
@@ -167,11 +167,11 @@ class DirectForecastModel(BaseTransitionModel):
 
     @property
     def known(self) -> frozenset[int]:
-        """Numbers of steps whose model is fitted."""
+        """The numbers of steps for which a model is fitted."""
         return frozenset(self._known)
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
-        """See TransitionModel; the report is that of the one-step model. Episodes too short for n steps leave n unlearned."""
+        """See TransitionModel; the report is that of the one-step model. If no episode has n steps, there is no n-step model."""
         began, share = time.perf_counter(), 1.0 / (1 + len(self.direct))
 
         def part(i: int) -> Callable[[float], None] | None:
@@ -188,9 +188,9 @@ class DirectForecastModel(BaseTransitionModel):
         return replace(report, seconds=time.perf_counter() - began, log=log)
 
     def forecast(self, states: States, strings: Actions, rng: Randomness) -> tuple[States, Bools]:
-        """A draw of where each string of actions leads, int64 [B, n], n >= 0.
+        """Samples the state after each string of actions, int64 [B, n], n >= 0.
 
-        By the model of n steps; where there is none, by that of the most steps below n, and from there step by step.
+        Uses the model of n steps; if there is none, that of the largest number of steps below n, followed by single steps.
 
         Returns:
             (states int64 [B, F], whether they are terminal bool [B]).
@@ -233,7 +233,7 @@ class DirectForecastModel(BaseTransitionModel):
         """See TransitionModel.
 
         Raises:
-            ValueError: the arrays are not those of a model of this shape; nothing is changed then.
+            ValueError: the arrays are not those of a model of this shape; the model is unchanged.
         """
         before = self.state_dict()
         try:
@@ -259,5 +259,5 @@ class DirectForecastModel(BaseTransitionModel):
 
 
 def random_strings(keys: Keys, n: int, n_actions: int) -> Actions:
-    """Random strings of actions, int64 [B, n], a row of numbers from each key."""
+    """Random strings of actions, int64 [B, n], one row from each key."""
     return (uniforms(keys, n) * n_actions).astype(np.int64)

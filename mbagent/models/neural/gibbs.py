@@ -1,6 +1,6 @@
-"""Gibbs sampling of outcomes, compiled: the paper's sweeps (3.2), which redraw each factor given all others.
+"""Compiled Gibbs sampling of outcomes: the paper's sweeps (3.2), which resample each factor given all others.
 
-A block of rows begins with the predictor's first guess and with the summed inputs of the factors that are uncertain.
+A block of rows starts with samples from the predictor and with the summed inputs of the uncertain factors.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from mbagent_envs.jit import borrowed, compiled, inlined, vectorised
 from mbagent_envs.random_keys import derive_one, fill_row
 
 LEEWAY = 2.0
-"""The conditioner is taken to raise the odds of an unlikely value of a trusted factor at most so many times."""
+"""Assumed largest factor by which the conditioner raises the odds of an unlikely value of a trusted factor."""
 
 GIBBS_ROWS = 64
-"""Rows that are worked on together, at most."""
+"""Largest number of rows in a block."""
 
 MOST_SUMS = 2**15
-"""Numbers in the summed inputs of all open factors of these rows, at most: more would not stay in the processor's cache."""
+"""Largest number of values in the summed inputs of all open factors of a block, so that they fit into the processor's cache."""
 
 ALWAYS = 2.0
-"""A bound that no random number reaches: as ``low`` it marks an open factor."""
+"""A bound above all random numbers: as ``low`` it marks an open factor."""
 
 
 class Block(NamedTuple):
@@ -45,12 +45,12 @@ class Block(NamedTuple):
 
     Attributes:
         guess: the next factors' columns, [R, C].
-        low: the conditioner is asked about a factor when its number is below this, [R, O].
-        high: or at least this, [R, O]; in between the factor is what the predictor thinks likeliest.
-        top: which value that is, int64 [R, O].
-        slot: where the sums of an open factor are, -1 where it is not open, int64 [R, O].
-        columns: all columns that are on at first, int64 [R, C + O + n_steps].
-        n_columns: how many, int64 [R].
+        low: the conditioner is evaluated for a factor if its random number is below this bound, [R, O],
+        high: or at least this bound, [R, O]; in between, the factor has the predictor's most likely value.
+        top: that value, int64 [R, O].
+        slot: index of an open factor's sums, -1 if the factor is not open, int64 [R, O].
+        columns: all columns that are 1 initially, int64 [R, C + O + n_steps].
+        n_columns: number of these columns, int64 [R].
         sums: input of the groups of open factors, [slots, G]; the last is for any other factor.
     """
 
@@ -68,18 +68,18 @@ class SweepWork(NamedTuple):
     """Work space for one row.
 
     Attributes:
-        active: input columns that are on, int64 [O + n_steps].
-        on: 1 where a column is on in the state, int64 [C].
-        columns: all columns that are on now, int64 [C + O + n_steps].
-        shift: from a column to its place among a group's, by whether it is on in the state and in the next one, int64 [4].
+        active: input columns that are 1, int64 [O + n_steps].
+        on: whether a column is 1 in the state, int64 [C].
+        columns: all columns that are 1 at present, int64 [C + O + n_steps].
+        shift: offset from a column to its index in a group, by whether it is 1 in the state and in the next state, int64 [4].
         chosen: factors that this sweep may change, int64 [O].
-        noise: a number for each factor, [O].
-        rank: another one, which orders them, [O].
-        ranks: that of the chosen ones, [O].
-        order: the chosen ones in that order, int64 [O].
-        hidden: nodes of one group, [1, G].
-        row_logits: of one factor, [K].
-        given: its distribution, [K].
+        noise: random number of each factor, [O].
+        rank: second random number of each factor, which determines the order, [O].
+        ranks: ranks of the chosen factors, [O].
+        order: the chosen factors in that order, int64 [O].
+        hidden: hidden nodes of one group, [1, G].
+        row_logits: logits of one factor, [K].
+        given: distribution of that factor, [K].
     """
 
     active: Ints
@@ -98,7 +98,7 @@ class SweepWork(NamedTuple):
 
 @compiled
 def work_space(n_rows: int, layout: Layout, group: GroupWeights) -> tuple[Block, SweepWork]:
-    """Room for a block, and for a row, of ``n_rows`` rows of a model of this shape."""
+    """Work space for a block of ``n_rows`` rows, and for one row, of a model of this shape."""
     n_outputs, size, n_values = len(layout.outputs), group.bias.shape[1], group.offset.shape[1]
     n_columns, n_active, rows = group.both_start - group.next_start, n_outputs + layout.n_steps, min(n_rows, GIBBS_ROWS)
     n_slots = 1 + max(n_outputs, min(rows * n_outputs, MOST_SUMS // size))
@@ -144,8 +144,8 @@ def begin_block(
     work: SweepWork,
     factors: Ints,
 ) -> int:
-    """Begins rows from ``first`` on, while there is room for the sums of their open factors; returns how many."""
-    # The caller keeps all of this alive: no references need be counted for every factor.
+    """Initialises rows from ``first`` on, while there is space for the sums of their open factors; returns their number."""
+    # The caller keeps all arrays alive, so that reference counting for every factor can be avoided.
     states, probs, factors = borrowed(states), borrowed(probs), borrowed(factors)
     layout, group, k, w = borrowed(layout), borrowed(group), borrowed(block), borrowed(work)
     n_slots = 0
@@ -165,7 +165,7 @@ def begin_block(
             k.slot[r, i] = n_slots + n_open if is_open else -1
             n_open += int(is_open)
         if n_slots + n_open >= len(k.sums):
-            return r  # this row is begun again in the next block
+            return r  # this row is initialised again in the next block
         n_slots += n_open
         k.n_columns[r] = list_columns(b, r, states, actions[b], layout, k, w, k.columns[r])
     return min(len(states) - first, len(k.low))
@@ -173,14 +173,14 @@ def begin_block(
 
 @vectorised
 def _draw_bits(probs: Floats, b: int, noise: Floats, factors: Ints) -> None:
-    """The first guess of row b where all factors are bits; this and the next three are apart so that each is one vector loop."""
+    """The initial sample of row b if all factors are bits; this and the next three are separate so that each is vectorised."""
     for i in range(len(noise)):
         factors[b, i] = int((noise[i] >= probs[b, i, 0]) & (probs[b, i, 1] > 0.0))
 
 
 @vectorised
 def _bound_bits(probs: Floats, b: int, r: int, group_of: Ints, certain: float, low: Floats, high: Floats) -> None:
-    """As ``_begin_factor`` sets ``low`` and ``high``."""
+    """Sets ``low`` and ``high`` as ``_begin_factor``."""
     for i in range(low.shape[1]):
         p0, p1 = probs[b, i, 0], probs[b, i, 1]
         trust = (max(p0, p1) >= certain) | (group_of[i] < 0)
@@ -192,7 +192,7 @@ def _bound_bits(probs: Floats, b: int, r: int, group_of: Ints, certain: float, l
 
 @vectorised
 def _likeliest_bits(probs: Floats, b: int, r: int, group_of: Ints, factors: Ints, top: Ints) -> None:
-    """As ``_begin_factor`` sets ``top``."""
+    """Sets ``top`` as ``_begin_factor``."""
     for i in range(top.shape[1]):
         likeliest = int(probs[b, i, 1] > probs[b, i, 0])
         top[r, i] = likeliest if group_of[i] >= 0 else factors[b, i]
@@ -200,7 +200,7 @@ def _likeliest_bits(probs: Floats, b: int, r: int, group_of: Ints, factors: Ints
 
 @vectorised
 def _show_bits(probs: Floats, b: int, r: int, factors: Ints, low: Floats, real_guess: bool, guess: Floats32) -> None:
-    """As ``_begin_factor`` sets ``guess``."""
+    """Sets ``guess`` as ``_begin_factor``."""
     for i in range(guess.shape[1]):
         real = real_guess & (low[r, i] == ALWAYS)
         guess[r, i] = np.float32(probs[b, i, 1] if real else float(factors[b, i]))
@@ -220,7 +220,7 @@ def _begin_factor(
     w: SweepWork,
     factors: Ints,
 ) -> None:
-    """Draws the first guess of factor i, and says when the conditioner is to be asked about it."""
+    """Draws the initial value of factor i, and sets the bounds outside which the conditioner is evaluated for it."""
     n, start, top = layout.outputs[i], layout.start[i], largest(probs, b, i, layout.outputs[i])
     value = draw_at(probs, b, i, n, w.noise[i])
     trust = trusted(probs, b, i, layout, group, certain)
@@ -238,7 +238,7 @@ def _begin_factor(
 
 @inlined
 def list_columns(b: int, r: int, states: Ints, action: int, layout: Layout, k: Block, w: SweepWork, columns: Ints) -> int:
-    """Lists the columns of row b that are on and returns how many; without branches, since bits cannot be foretold."""
+    """Lists the columns of row b that are 1 and returns their number; without branches, which would be unpredictable."""
     n_active, n = active_columns(states, b, action, layout, w.active), 0
     w.on[:] = 0
     for a in range(n_active - layout.n_steps):
@@ -262,12 +262,12 @@ def sum_columns(
     Args:
         i: the factor.
         r: row of the block.
-        columns: that are on.
-        n_columns: how many.
+        columns: the columns that are 1.
+        n_columns: number of these columns.
         group: the conditioner.
-        real_guess: whether some may be on by a part.
+        real_guess: whether some may have values between 0 and 1.
         k: the block.
-        slot: where.
+        slot: row of ``k.sums``.
     """
     g = group.group_of[i]
     copy_row(group.bias, g, k.sums, slot)
@@ -280,7 +280,7 @@ def sum_columns(
 
 @compiled
 def sum_up(n_rows: int, layout: Layout, group: GroupWeights, real_guess: bool, block: Block) -> None:
-    """Sums up the inputs of all open factors under the first guess: group after group, each for all rows while it is at hand."""
+    """Sums the inputs of all open factors for the initial values: by group, each for all rows while its weights are cached."""
     layout, group, k = borrowed(layout), borrowed(group), borrowed(block)
     for i in range(len(layout.outputs)):
         for r in range(n_rows):
@@ -296,8 +296,8 @@ _ORDER = np.uint64(1 << 32)
 def _shuffle(n: int, key: np.uint64, w: SweepWork) -> None:
     """Lists the first ``n`` of ``w.chosen`` in a random order, in ``w.order``.
 
-    Any two come in the same order whichever others are there: sweeps over some of the factors are like those over all. Each one's
-    place is how many come before it, counted without branches: those of a sort could not be foretold.
+    The relative order of two factors does not depend on the other factors, so sweeps over some factors agree with those over
+    all. A factor's position is the number of factors before it, counted without branches, which would be unpredictable.
     """
     fill_row(key, w.rank)
     for step in range(n):
@@ -320,7 +320,7 @@ def sample_sweeps(
     sweeps: int,
     real_guess: bool,
 ) -> Ints:
-    """The paper's procedure: the predictor's guess, then ``sweeps`` passes that redraw each factor given all others.
+    """The paper's procedure: samples from the predictor, then ``sweeps`` passes that resample each factor given all others.
 
     Args:
         states: int64 [B, F].
@@ -330,14 +330,14 @@ def sample_sweeps(
         keys: uint64 [B].
         layout: the factors.
         group: the conditioner, masked "others".
-        certain: a factor whose likeliest value has this probability in the predictor's eyes takes that value in every sweep,
-            without the conditioner, unless the number drawn for it lies so far out that the conditioner could say otherwise
-            by raising the odds ``LEEWAY`` times. Where it never raises them more, the draws are those of the full sweep.
-        sweeps: passes; each in a random order of its own.
-        real_guess: the first guess is the predictor's probabilities; else bits drawn from them.
+        certain: a factor whose most likely value has at least this probability by the predictor takes that value in every sweep,
+            without the conditioner, unless its random number is so extreme that the conditioner could change the value by
+            raising the odds by the factor ``LEEWAY``. If it never raises them more, the samples are those of the full sweep.
+        sweeps: number of passes, each in a new random order.
+        real_guess: the initial values are the predictor's probabilities; else bits drawn from them.
 
     Returns:
-        Draws int64 [B, O].
+        Samples int64 [B, O].
     """
     factors = np.empty((len(states), len(layout.outputs)), dtype=np.int64)
     block, work = work_space(len(states), layout, group)
@@ -368,7 +368,7 @@ def _sweep_row(
     work: SweepWork,
     factors: Ints,
 ) -> None:
-    """The sweeps of row b, r of its block, to ``factors`` [B, O]."""
+    """Performs the sweeps of row b, which is row r of its block, in ``factors`` [B, O]."""
     states, logits, factors = borrowed(states), borrowed(logits), borrowed(factors)
     layout, group, k, w = borrowed(layout), borrowed(group), borrowed(block), borrowed(work)
     for sweep in range(sweeps):
@@ -393,7 +393,7 @@ def _sweep_row(
 
 @inlined
 def _choose(b: int, r: int, k: Block, w: SweepWork, factors: Ints) -> int:
-    """Writes the factors that this sweep may change to ``w.chosen``; returns how many."""
+    """Writes the factors that this sweep may change to ``w.chosen``; returns their number."""
     n = 0
     for i in range(len(w.noise)):
         w.chosen[n] = i
@@ -405,7 +405,7 @@ def _choose(b: int, r: int, k: Block, w: SweepWork, factors: Ints) -> int:
 def _change(
     r: int, i: int, value: int, begin: int, end: int, layout: Layout, group: GroupWeights, k: Block, w: SweepWork
 ) -> None:
-    """Writes factor i's value to its columns, and what that changes to the sums of the open factors from ``begin`` on."""
+    """Writes factor i's value to its columns; updates the open factors' sums at positions ``begin`` to ``end`` of the order."""
     n = layout.outputs[i]
     for v in range(1 if n == 2 else 0, n):
         column = layout.start[i] + (0 if n == 2 else v)

@@ -1,7 +1,7 @@
-"""What the connections that are left say about the world: influences, and modules (paper section 5, figures 11 and 12).
+"""Dependencies between variables according to the remaining connections: influences and variable groups (paper section 5).
 
 "If we can find that some sets of variables are conditionally independent of one another, we can separate them into different
-modules." Shapes: F state factors, O = F + 1 output factors (``terminated`` last), A actions.
+modules" (figures 11 and 12). Shapes: F state factors, O = F + 1 output factors (``terminated`` last), A actions.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from mbagent.types import Floats, Ints
 
 @dataclass(frozen=True)
 class Influence:
-    """Sums of absolute weights over all paths; 0 where no connection is left.
+    """Sums of absolute weights over all paths to each output factor; 0 if there is no path.
 
     Attributes:
-        states: from a state factor to an output factor, in the predictor, [O, F].
-        actions: from an action, in the predictor, [O, A].
-        others: from what another output factor becomes, in the conditioner, [O, O].
-        conditions: from a state factor, in the conditioner, [O, F].
+        states: from each state factor, in the predictor, [O, F].
+        actions: from each action, in the predictor, [O, A].
+        others: from each other output factor, in the conditioner, [O, O].
+        conditions: from each state factor, in the conditioner, [O, F].
     """
 
     states: Floats
@@ -39,12 +39,12 @@ class Influence:
 
 @dataclass(frozen=True)
 class VariableGroup:
-    """Variables that belong together.
+    """A connected component of the dependency graph.
 
     Attributes:
         outputs: output factors, int64.
-        inputs: state factors that lead to them, int64.
-        action: whether the action does, too.
+        inputs: state factors with a path to them, int64.
+        action: whether the action has a path to them.
     """
 
     outputs: Ints
@@ -52,7 +52,7 @@ class VariableGroup:
     action: bool
 
     def text(self, names: Sequence[str]) -> str:
-        """One line, with the names of the state factors."""
+        """The group as one line of text, with the names of the state factors."""
         names = [*names, "terminated"]
         given = [names[i] for i in self.inputs] + ["action"] * self.action
         return f"{', '.join(names[i] for i in self.outputs)} <- {', '.join(given) or 'nothing'}"
@@ -62,15 +62,15 @@ def influence(model: NetworkPair, *, effective: bool = False) -> Influence:
     """The sums over paths of both networks.
 
     Args:
-        model: networks.
-        effective: leave out, in a pruned model of bits, what makes no difference, such as paths that cancel each other (see
-            ``tabulate.find_parents``).
+        model: the networks.
+        effective: whether to omit, in a pruned model of bits, dependencies without effect, such as paths that cancel each other
+            (see ``truth_tables.find_parents``).
 
     Raises:
         ValueError: the predictor is not a dense one: weights shared over positions have no variables of their own.
     """
     if not isinstance(model.predictor, DensePredictor):
-        raise ValueError("Sums over paths are of networks on flat variables; this model shares its weights over positions.")
+        raise ValueError("Sums over paths need networks on flat variables; this model shares its weights over positions.")
     codec, predictor = model.codec, model.predictor
     layers = [_absolute(layer) for layer in (*predictor.layers, predictor.out) if isinstance(layer, Affine)]
     columns = layers[0]
@@ -103,7 +103,7 @@ def _absolute(layer: Affine) -> Floats:
 
 
 def _conditioner_sums(conditioner: Conditioner) -> Floats:
-    """From columns of (s, a) and of the next factors to each group's output, [g, n_inputs + n_columns]."""
+    """Sums from columns of (s, a) and of the next factors to each group's output, [g, n_inputs + n_columns]."""
     groups = _absolute(conditioner.groups)
     if conditioner.groups.mask is not None:
         groups *= conditioner.groups.mask.numpy()
@@ -114,7 +114,7 @@ def _conditioner_sums(conditioner: Conditioner) -> Floats:
 
 
 def modules(found: Influence) -> list[VariableGroup]:
-    """Variables that fall apart: linked where one leads to the other in a step. Largest first; without what hangs on nothing."""
+    """Independent groups of variables, linked by one-step dependencies; largest first, without isolated variables."""
     n = len(found.states)
     links = np.zeros((n, n), dtype=np.bool_)
     links[:, : n - 1] = found.states > 0.0
@@ -122,12 +122,12 @@ def modules(found: Influence) -> list[VariableGroup]:
 
 
 def dependent_groups(found: Influence) -> list[VariableGroup]:
-    """Variables that are drawn together: linked by the conditioner, given state and action. Largest first."""
+    """Groups of variables that depend on each other given state and action, by the conditioner; largest first."""
     return _modules(found, found.others > 0.0)
 
 
 def _modules(found: Influence, links: NDArray[np.bool_]) -> list[VariableGroup]:
-    """The connected components of more than one variable, or of one that leads to itself."""
+    """The connected components of more than one variable, or of one that depends on itself."""
     _, label = connected_components(csr_matrix(links.astype(np.int64)), directed=False)
     result = []
     for component in range(label.max() + 1):

@@ -1,7 +1,7 @@
-"""Compiled inference of the networks of ``networks.py``, row by row, and the loops that it spends its time in.
+"""Compiled inference of the networks of ``networks.py``, row by row, with its inner loops.
 
-Torch trains; here each row of a batch is computed by itself, in one fixed order of operations. So a row's result is the same to
-the last bit alone and in any batch, which matrix products do not promise, and inputs that are 0 cost nothing.
+Networks are trained by torch; here each row of a batch is computed separately, in a fixed order of operations. So a row's result
+is bitwise the same alone and in any batch, which matrix products do not guarantee, and inputs that are 0 need no time.
 Shapes: B batch, F state factors, O = F + 1 output factors, K largest cardinality, G hidden nodes in a group, g groups.
 """
 
@@ -32,9 +32,9 @@ _P3, _P4, _P5 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1), np.flo
 
 @compiled
 def exp32(x: np.float32) -> np.float32:
-    """e^x to 7e-8 of its size, for x from -87 to 88 and as at these ends beyond: of the library's function no vectors are made.
+    """exp(x) with relative error 7e-8, x being clipped to [-87, 88]; unlike the library's function it can be vectorised.
 
-    2^n times a polynomial (Moshier's Cephes library, ``expf``); n goes straight to the exponent's place among the bits.
+    2^n times a polynomial (Moshier's Cephes library, ``expf``); n is written directly to the exponent bits.
     """
     x = _LOWEST if x < _LOWEST else x
     x = _HIGHEST if x > _HIGHEST else x
@@ -52,7 +52,7 @@ _WIDE_HIGH, _WIDE_LOW = 6.93145751953125e-1, 1.42860682030941723212e-6
 
 @compiled
 def exp64(x: float) -> float:
-    """As ``exp32`` in double precision, to 4e-16 of its size, for x from -708 to 0; below as at -708."""
+    """As ``exp32`` in double precision, with relative error 4e-16, for x <= 0; smaller x are clipped to -708."""
     x = max(x, -708.0)
     n = np.floor(x * 1.4426950408889634 + 0.5)
     r = (x - n * _WIDE_HIGH) - n * _WIDE_LOW
@@ -63,7 +63,7 @@ def exp64(x: float) -> float:
 
 @vectorised
 def activate(table: Floats32, row: int, n: int, code: int) -> None:
-    """Applies the activation of this code to the first ``n`` values of ``table[row]``, in place."""
+    """Applies the activation with this code to the first ``n`` values of ``table[row]``, in place."""
     if code == RELU:
         for h in range(n):
             table[row, h] = max(table[row, h], np.float32(0.0))
@@ -80,7 +80,7 @@ def activate(table: Floats32, row: int, n: int, code: int) -> None:
 
 @vectorised
 def add_rows(table: Floats32, rows: Ints, n_rows: int, out: Floats32, row: int) -> None:
-    """Adds the first ``n_rows`` of ``rows`` of ``table`` [rows, G] to ``out[row]`` [G]; see ``add_columns``."""
+    """Adds the rows of ``table`` [rows, G] with the first ``n_rows`` indices in ``rows`` to ``out[row]``; see ``add_columns``."""
     c = 0
     while c + 4 <= n_rows:
         c0, c1, c2, c3 = rows[c], rows[c + 1], rows[c + 2], rows[c + 3]
@@ -97,8 +97,8 @@ def add_rows(table: Floats32, rows: Ints, n_rows: int, out: Floats32, row: int) 
 def add_products(values: Floats32, n_rows: int, n_values: int, weights: Floats32, out: Floats32) -> None:
     """Adds ``weights`` [4 * m, H] times the first ``n_values`` of ``values`` [R, H] to ``n_rows`` rows of ``out`` [R, 4 * m].
 
-    Four sums at a time: each of ``values`` is read a quarter as often. All rows one after another with the same weights, while
-    these are at hand; what is computed of a row does not depend on that.
+    Four sums at a time, so that ``values`` are read a quarter as often. All rows are processed while the weights are cached; a
+    row's result does not depend on the other rows.
     """
     for k in range(0, weights.shape[0], 4):
         for r in range(n_rows):
@@ -117,9 +117,9 @@ def add_products(values: Floats32, n_rows: int, n_values: int, weights: Floats32
 
 @vectorised
 def add_columns(table: Floats32, g: int, columns: Ints, n_columns: int, sums: Floats32, row: int) -> None:
-    """Adds to ``sums[row]`` [G] what group g gets from the first ``n_columns`` of ``columns``; ``table`` is [g, columns, G].
+    """Adds to ``sums[row]`` [G] the weights of group g for the first ``n_columns`` of ``columns``; ``table`` is [g, columns, G].
 
-    Four columns at a time, which halves the time: ``sums`` is read and written a quarter as often.
+    Four columns at a time, which halves the time, since ``sums`` is read and written a quarter as often.
     """
     c = 0
     while c + 4 <= n_columns:
@@ -136,21 +136,21 @@ def add_columns(table: Floats32, g: int, columns: Ints, n_columns: int, sums: Fl
 
 @vectorised
 def add_scaled(table: Floats32, g: int, column: int, scale: np.float32, sums: Floats32, row: int) -> None:
-    """Adds to ``sums[row]`` [G] what group g gets from one column of ``table`` [g, columns, G], times ``scale``."""
+    """Adds to ``sums[row]`` [G] the weights of group g for one column of ``table`` [g, columns, G], times ``scale``."""
     for h in range(table.shape[2]):
         sums[row, h] += scale * table[g, column, h]
 
 
 @vectorised
 def copy_row(table: Floats32, row: int, out: Floats32, out_row: int) -> None:
-    """Copies ``table[row]`` to ``out[out_row]``, without slices, which cost more."""
+    """Copies ``table[row]`` to ``out[out_row]``, without slices, which are slower."""
     for h in range(table.shape[1]):
         out[out_row, h] = table[row, h]
 
 
 @vectorised
 def count_below(values: Floats, begin: int, end: int, limit: float, or_equal: bool) -> int:
-    """How many of ``values[begin:end]`` are below a limit, or equal to it."""
+    """Number of ``values[begin:end]`` below a limit, or, with ``or_equal``, not above it."""
     n = 0
     if or_equal:
         for i in range(begin, end):
@@ -163,7 +163,7 @@ def count_below(values: Floats, begin: int, end: int, limit: float, or_equal: bo
 
 @vectorised
 def product(sums: Floats32, row: int, code: int, table: Floats32, g: int, k: int) -> np.float32:
-    """The activations of ``sums[row]`` [G] times ``table[g, k]`` [G]."""
+    """Scalar product of the activations of ``sums[row]`` [G] with ``table[g, k]`` [G]."""
     total = np.float32(0.0)
     if code == RELU:
         for h in range(table.shape[2]):
@@ -206,7 +206,7 @@ def softmax(logits: Floats32, n: int, out: Floats) -> None:
 
 @vectorised
 def write_bits(columns: Floats32, row: int, logits: Floats32, b: int) -> None:
-    """Writes row b of ``logits`` [B, O, 2] where all factors are bits, from ``columns[row]`` [O or more]; the logit of 0 is 0."""
+    """Writes row b of ``logits`` [B, O, 2] for factors that are all bits, from ``columns[row]``; the logit of value 0 is 0."""
     for i in range(logits.shape[1]):
         logits[b, i, 0] = np.float32(0.0)
         logits[b, i, 1] = columns[row, i]
@@ -214,14 +214,14 @@ def write_bits(columns: Floats32, row: int, logits: Floats32, b: int) -> None:
 
 @vectorised
 def add_signed(states: Ints, b: int, weights: Floats32, row: int, out: Floats32, out_row: int) -> None:
-    """Adds ``weights[row]`` [F] to ``out[out_row]`` where the bits ``states[b]`` [F] are 1, and subtracts it where they are 0."""
+    """Adds ``weights[row]`` [F] to ``out[out_row]`` where the bits ``states[b]`` [F] are 1; subtracts it where they are 0."""
     for i in range(states.shape[1]):
         out[out_row, i] += np.float32(2 * states[b, i] - 1) * weights[row, i]
 
 
 @vectorised
 def _bit_probabilities(logits: Floats32, b: int, out: Floats) -> None:
-    """Row b of ``probabilities`` where all factors are bits."""
+    """Row b of ``probabilities`` for factors that are all bits."""
     for i in range(logits.shape[1]):
         difference = np.float64(logits[b, i, 1]) - np.float64(logits[b, i, 0])
         small = exp64(-abs(difference))
@@ -233,7 +233,7 @@ def _bit_probabilities(logits: Floats32, b: int, out: Floats) -> None:
 
 @compiled
 def probabilities(logits: Floats32, outputs: Ints) -> Floats:
-    """Each factor's distribution, float64 [B, O, K], from logits [B, O, K]; 0 for values a factor lacks."""
+    """Each factor's distribution, float64 [B, O, K], from logits [B, O, K]; 0 for values that a factor does not have."""
     out = np.zeros(logits.shape, dtype=np.float64)
     row_logits = np.empty(logits.shape[2], dtype=np.float32)
     row = np.empty(logits.shape[2], dtype=np.float64)
@@ -252,16 +252,16 @@ def probabilities(logits: Floats32, outputs: Ints) -> Floats:
 
 
 KERNEL_ROWS = 32
-"""Rows of a batch that a predictor's layers are applied to one after another, with the same weights at hand."""
+"""Rows of a batch to which each layer of a predictor is applied while its weights are cached."""
 
 
 class Layout(NamedTuple):
-    """Where factors lie among columns.
+    """Layout of factors among columns.
 
     Attributes:
         outputs: cardinalities of the output factors, int64 [O]; the first F are the state's.
         start: first column of each output factor, int64 [O].
-        n_state_columns: columns of the state; those of the action follow.
+        n_state_columns: columns of the state, followed by those of the action.
         n_actions: actions A of a single step.
         n_steps: actions in a string, see ``FactorCodec``.
     """
@@ -280,12 +280,12 @@ class DenseWeights(NamedTuple):
         first: from (state, action) columns, [n_inputs, H] (L = 0: [n_inputs, C]).
         inner: to hidden layers 1 ... L - 1 from those before, [max(L - 1, 0), H to, H from].
         bias: of the hidden layers, [L, H].
-        sizes: of the hidden layers with padding, a multiple of ``packing.LANES``, int64 [L].
+        sizes: padded sizes of the hidden layers, multiples of ``export.LANES``, int64 [L].
         to_columns: to the output columns, [C, H].
         column_bias: [C].
-        stay: the residual path's, [n_steps * A, n_state_columns]; zero where there is none.
+        stay: weights of the residual path, [n_steps * A, n_state_columns]; zero if there is none.
         n_columns: output columns without padding.
-        activation: one of the codes of ``arithmetic.py``.
+        activation: one of the codes in ACTIVATION_CODES.
     """
 
     first: Floats32
@@ -313,16 +313,16 @@ class GroupWeights(NamedTuple):
     """A ``Conditioner`` with g groups.
 
     Attributes:
-        group_of: group of each output factor, -1 where it has none, int64 [O].
+        group_of: group of each output factor, -1 if it has none, int64 [O].
         columns: weights from all columns, [g, n_inputs + n_columns + n_state_columns, G]: of state and action, of the next
-            factors (zero where pruned), and of the state's columns that are on in the state and in the next one, too. Most
-            columns are alike in both: one addition does for two then.
+            factors (zero where pruned), and the sums of both for columns that are 1 in the state and in the next state. Since
+            most columns are equal in both, this saves additions.
         bias: [g, G].
-        to_values: to the logits of the group's factor, [g, K, G]; of a bit, the logit of 0 is 0.
+        to_values: to the logits of the group's factor, [g, K, G]; for a bit, the logit of 0 is 0.
         offset: [g, K].
-        next_start: place of the next factors' columns, n_inputs.
-        both_start: place of those that are on in both, n_inputs + n_columns.
-        activation: one of the codes of ``arithmetic.py``.
+        next_start: index of the first column of the next factors, n_inputs.
+        both_start: index of the first column for values that are 1 in both, n_inputs + n_columns.
+        activation: one of the codes in ACTIVATION_CODES.
         correction: whether the predictor's logits are added.
     """
 
@@ -338,12 +338,12 @@ class GroupWeights(NamedTuple):
 
     @property
     def inputs(self) -> Floats32:
-        """From (state, action) columns, [g, n_inputs, G]."""
+        """Weights from (state, action) columns, [g, n_inputs, G]."""
         return self.columns[:, : self.next_start]
 
     @property
     def others(self) -> Floats32:
-        """From the next factors' columns, [g, n_columns, G]."""
+        """Weights from the next factors' columns, [g, n_columns, G]."""
         return self.columns[:, self.next_start : self.both_start]
 
     @property
@@ -354,14 +354,14 @@ class GroupWeights(NamedTuple):
 
 @inlined
 def active_columns(states: Ints, b: int, action: int, layout: Layout, out: Ints) -> int:
-    """Writes the input columns of row b that are 1 to ``out`` [F + n_steps]; returns how many; the actions' come last."""
+    """Writes the input columns of row b that are 1 to ``out`` [F + n_steps], the actions' last; returns their number."""
     n = 0
     for factor in range(states.shape[1]):
         value = states[b, factor]
         if layout.outputs[factor] != 2:
             out[n] = layout.start[factor] + value
             n += 1
-        else:  # without a branch: bits cannot be foretold
+        else:  # without a branch, which would be unpredictable
             out[n] = layout.start[factor]
             n += value
     for step in range(layout.n_steps):
@@ -374,10 +374,10 @@ def active_columns(states: Ints, b: int, action: int, layout: Layout, out: Ints)
 def add_next(
     states: Ints, b: int, i: int, value: int, layout: Layout, group: GroupWeights, columns: Ints, n: int, place: int
 ) -> int:
-    """Adds what a group sees of factor i's next value to the list ``columns`` of ``active_columns``; returns its new length.
+    """Adds the column of factor i's next value to the list ``columns`` of ``active_columns``; returns its new length.
 
-    ``place`` is where the list has the state's column of the factor, if that is on. Written without branches: bits cannot be
-    foretold.
+    ``place`` is the index in the list of the factor's column in the state, if that is 1. Without branches, which would be
+    unpredictable.
     """
     column, on = layout.start[i], 1
     if layout.outputs[i] == 2:
@@ -394,7 +394,7 @@ def add_next(
 
 @inlined
 def next_place(states: Ints, b: int, i: int, layout: Layout, place: int) -> int:
-    """Place among ``active_columns`` of the factor after i, if its column is on, from that of factor i."""
+    """Index among ``active_columns`` of the factor after i, if its column is 1, given that of factor i."""
     if i < states.shape[1]:
         place += 1 if layout.outputs[i] != 2 else states[b, i]
     return place
@@ -404,7 +404,7 @@ def next_place(states: Ints, b: int, i: int, layout: Layout, place: int) -> int:
 def _add_residual(
     states: Ints, b: int, active: Ints, n_active: int, layout: Layout, stay: Floats32, columns: Floats32, r: int
 ) -> None:
-    """Adds what leads each state column to itself: its weight where it is 1, minus its weight where it is 0."""
+    """Adds the residual path of each state column: its weight where the column is 1, minus its weight where it is 0."""
     n_on = n_active - layout.n_steps
     for step in range(n_on, n_active):
         row = active[step] - layout.n_state_columns
@@ -457,7 +457,7 @@ def _dense_block(
 
 @compiled
 def dense_logits(states: Ints, actions: Ints, layout: Layout, dense: DenseWeights) -> Floats32:
-    """A dense predictor's logits, float32 [B, O, K]; values a factor lacks are at -1e9."""
+    """A dense predictor's logits, float32 [B, O, K]; -1e9 for values that a factor does not have."""
     n_outputs, width = len(layout.outputs), layout.outputs.max()
     logits = np.full((len(states), n_outputs, width), np.float32(-1e9), dtype=np.float32)
     rows = min(len(states), KERNEL_ROWS)
@@ -485,7 +485,7 @@ def dense_logits(states: Ints, actions: Ints, layout: Layout, dense: DenseWeight
 
 @inlined
 def trusted(probs: Floats, b: int, i: int, layout: Layout, group: GroupWeights, certain: float) -> bool:
-    """Whether factor i of row b is left to the predictor, which gives it the distributions ``probs`` [B, O, K]."""
+    """Whether factor i of row b is sampled from the predictor alone, whose distributions are ``probs`` [B, O, K]."""
     if group.group_of[i] < 0:
         return True
     return bool(probs[b, i, largest(probs, b, i, layout.outputs[i])] >= certain)
@@ -504,12 +504,12 @@ def finish(
     row_logits: Floats32,
     out: Floats,
 ) -> None:
-    """From the summed input ``sums[row]`` [G] of factor i's group to the factor's distribution ``out`` [K].
+    """Computes factor i's distribution ``out`` [K] from the summed input ``sums[row]`` [G] of its group.
 
     ``logits`` [B, O, K] are the predictor's; ``hidden`` [1, G] and ``row_logits`` [K] are work space.
     """
     n, g, code = layout.outputs[i], group.group_of[i], group.activation
-    if n > 2:  # each node once, for all values
+    if n > 2:  # each node's activation once, for all values
         for h in range(hidden.shape[1]):
             hidden[0, h] = sums[row, h]
         activate(hidden, 0, hidden.shape[1], code)

@@ -1,4 +1,4 @@
-"""The learned model of the paper's section 3: a predictor network, and a conditioner network on top of it."""
+"""The learned model of the paper's section 3: a predictor network and a conditioner network."""
 
 from __future__ import annotations
 
@@ -36,15 +36,16 @@ from mbagent.types import Actions, Bools, Floats, Randomness, States
 PrunedAs: TypeAlias = Literal["tables", "connections", "matrices"]
 
 FEW = 0.2
-"""Share of the connections up to which lists of them are quicker than whole matrices, which processors multiply in bulk."""
+"""Share of remaining connections below which sparse lists are faster than dense matrices."""
 
 
 class NeuralTransitionModel(NetworkPair):
     """A predictor network, alone or with a conditioner network. Arguments are those of NetworkPair.
 
     Attributes:
-        pruned_as: what a pruned model of bits is drawn from: "tables" of bits that few inputs are left of, the others'
-            connections if these are few; "connections" of all; or the whole "matrices", as before pruning.
+        pruned_as: representation from which a pruned model of bits is sampled: "tables" (truth tables of bits with few
+            remaining inputs; the connections of the others, if these are few), "connections" of all bits, or dense
+            "matrices", as before pruning.
     """
 
     pruned_as: PrunedAs = "tables"
@@ -57,12 +58,12 @@ class NeuralTransitionModel(NetworkPair):
 
     @one_thread()
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
-        """See TransitionModel; fits anew from first weights that depend on ``seed`` only, whatever was fitted before.
+        """See TransitionModel; starts from initial weights that depend only on ``seed``, not on earlier fits.
 
-        Going on from the weights of an earlier fit was measured, too: it takes half the time or less, but ends 0.001 to
-        0.003 nats a transition worse than fitting anew to all the data, and depends on what was fitted before.
+        The alternative of continuing from the weights of an earlier fit was measured: it takes half the time or less, but
+        its loss is 0.001 to 0.003 nats per transition higher, and depends on the earlier fits.
 
-        The predictor is fitted first; then the conditioner, with groups for the factors that the predictor leaves open.
+        The predictor is fitted first; then the conditioner, with groups for the factors of which the predictor is uncertain.
         """
         began = time.perf_counter()
         generator = self._build(seed)
@@ -89,23 +90,25 @@ class NeuralTransitionModel(NetworkPair):
         progress: Callable[[float], None] | None = None,
         config: PruningConfig | None = None,
     ) -> FitReport:
-        """Removes the smallest weights of both networks and trains what is left (paper section 5); see ``pruning``.
+        """Removes the smallest weights of both networks and trains the remaining ones (paper section 5); see ``pruning``.
 
         Args:
-            data: what the model was fitted to; the same ``seed`` holds out the same rows.
-            fraction: least share of the connections of each network that are gone afterwards, in [0, 1); more go where the data
-                do not call for them (``PruningConfig.evidence``). What is gone stays gone when the model is pruned again; ``fit``
-                begins anew with all connections.
-            seed: of the rows held out and of the batches.
-            progress: is told the share done, 0 ... 1.
+            data: the transitions to which the model was fitted; the same ``seed`` holds out the same rows.
+            fraction: smallest share of each network's connections that are removed, in [0, 1); further ones are removed if the
+                data do not support them (``PruningConfig.evidence``). Later calls keep connections removed; ``fit`` starts
+                again with all connections.
+            seed: seed of the held-out rows and of the batches.
+            progress: called with the completed share, 0 ... 1.
             config: see PruningConfig.
 
         Raises:
-            ValueError: a fraction outside [0, 1), or no data; the model is as it was then, as after any other error.
+            ValueError: a fraction outside [0, 1), or no data. After this or any other error the model is unchanged.
         """
         fraction, began, before = check_fraction(fraction), time.perf_counter(), self.state_dict()
         if not len(data):
-            raise ValueError("There are no transitions to train what is left on: hand over those that the model was fitted to.")
+            raise ValueError(
+                "There are no transitions to train the remaining connections on: pass those that the model was fitted to."
+            )
         rows = data.split(self.config.training.validation, seed)
         train, held_out = examples(rows[0]), examples(rows[1])
         trainer = Trainer(self.codec, self.predictor, self.conditioner, self.config.training)
@@ -147,7 +150,7 @@ class NeuralTransitionModel(NetworkPair):
         )
 
     def _exact_match(self, rows: Examples) -> float:
-        """Weighted share of transitions whose likeliest outcome, factor after factor, is the one met."""
+        """Weighted share of transitions whose observed outcome is the most likely one, chosen factor by factor."""
         states, actions, outcomes = rows.states.numpy(), rows.actions.numpy(), rows.outcomes.numpy()
         logits, probs = self._predict(states, actions)
         likeliest = probs.argmax(axis=2)
@@ -171,7 +174,7 @@ class NeuralTransitionModel(NetworkPair):
     def observe(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> None:
         """The paper's on-line method: one gradient step with each observation's own outcome as target.
 
-        Follows a world whose dynamics change; slower, and it depends on the order of what is seen.
+        Adapts to changing dynamics, but is slower than ``fit`` and depends on the order of observations.
         """
         trainer = Trainer(self.codec, self.predictor, self.conditioner, self.config.training)
         if self._online is None:
@@ -227,7 +230,7 @@ class NeuralTransitionModel(NetworkPair):
         return probs[:, possible]
 
     def probabilities(self, states: States, actions: Actions) -> Floats:
-        """The predictor's output for every factor, ``terminated`` last: float64 [B, O, K], 0 where a factor lacks a value."""
+        """The predictor's distribution of every factor, ``terminated`` last: float64 [B, O, K], 0 for values it does not have."""
         return self._predict(*as_rows(states, actions, len(self.cardinalities)))[1]
 
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
@@ -247,7 +250,7 @@ class NeuralTransitionModel(NetworkPair):
         return log_prob_causal(states, actions, outcomes, logits, probs, self._layout, self._packed_groups(), self.config.certain)
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
-        """See TransitionModel; systematic draws where probabilities are exact (``systematic.py``), else plain draws."""
+        """See TransitionModel; systematic sampling (``systematic_sampling.py``) if probabilities are exact, else samples."""
         if self.config.conditioner == "others":
             return super().successors(states, actions, n_samples, seed)
         states, actions = as_rows(states, actions, len(self.cardinalities))
@@ -267,7 +270,7 @@ class NeuralTransitionModel(NetworkPair):
         )
 
     def kernel(self) -> CausalBits | BitRules | None:
-        """The networks, or what pruning left of them, for compiled search (see ``compiled_model``); else None."""
+        """The networks, possibly pruned, for compiled search (see ``models.overloads``); None if not supported."""
         if self.config.conditioner != "causal" or not isinstance(self.predictor, DensePredictor):
             return None
         if (rules := self.rules(settled=True)) is not None:
@@ -278,7 +281,7 @@ class NeuralTransitionModel(NetworkPair):
         return self._packed_bits
 
     def rules(self, settled: bool = False) -> BitRules | None:
-        """What is left of a pruned model of bits, which it samples with, or searches with (``settled``); None of any other."""
+        """Rules of a pruned model of bits, for sampling or, with ``settled``, for search; None for any other model."""
         if not len(self._marks) or self.pruned_as == "matrices" or (pair := self._pair()) is None:
             return None
         key = (self.pruned_as, self.config.certain)
@@ -294,7 +297,7 @@ class NeuralTransitionModel(NetworkPair):
         return self._rules[key][settled]
 
     def modules(self) -> list[VariableGroup]:
-        """The sets of variables that fall apart into models of their own (paper section 5), largest first; see ``modules``.
+        """The independent groups of variables (paper section 5), largest first; see ``influence.modules``.
 
         Raises:
             ValueError: weights are shared over positions, or the predictor is not a dense one.
@@ -302,11 +305,11 @@ class NeuralTransitionModel(NetworkPair):
         return modules(influence(self, effective=True))
 
     def dependent_groups(self) -> list[VariableGroup]:
-        """The sets of variables that are drawn together, given state and action; as ``modules``."""
+        """The groups of variables that depend on each other given state and action; see ``influence.dependent_groups``."""
         return dependent_groups(influence(self, effective=True))
 
     def _pair(self) -> Pair | None:
-        """The networks, where they can become tables: of bits, single actions, and each bit given those before it, at most."""
+        """The networks, if they can be tabulated: of bits and single actions, with a causal conditioner or none; else None."""
         bits = self.codec.all_binary and self.codec.n_steps == 1 and self.config.conditioner != "others"
         if not bits or not isinstance(self.predictor, DensePredictor):
             return None

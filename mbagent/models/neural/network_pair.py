@@ -1,4 +1,4 @@
-"""The two networks of a neural model: how they are built, kept as arrays, and which of their connections are left."""
+"""The two networks of a neural model: construction, conversion to arrays, and remaining connections."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mbagent.models.protocol import LARGEST_NUMBER
 
 @dataclass(frozen=True)
 class NeuralConfig:
-    """What the networks look like and how they are used.
+    """Architecture and use of the networks.
 
     Attributes:
         hidden: sizes of the dense predictor's hidden layers.
@@ -31,13 +31,13 @@ class NeuralConfig:
             independent given state and action).
         group_size: hidden nodes in each of the conditioner's groups.
         correction: whether the conditioner's output is added to the predictor's logits.
-        certain: a factor whose likeliest value has this probability in the predictor's eyes is left to the predictor; in sweeps
-            the conditioner is asked about it only where the number drawn could matter (``sweep_blocks.LEEWAY``).
-        dropout: share of hidden nodes zeroed in each training step; without it, networks learn the noise of rare
-            states. None: 0.4, or 0 where the state is a single factor: its columns show nothing that states have in
-            common, the network is a table then, and dropout only blurs it.
-        sweeps: passes over all factors, mask "others".
-        real_guess: whether the first guess is the predictor's probabilities rather than bits drawn from them.
+        certain: a factor whose most likely value has at least this probability by the predictor is sampled from the predictor;
+            in sweeps the conditioner is evaluated for it only if the random number is extreme (``gibbs.LEEWAY``).
+        dropout: share of hidden nodes zeroed in each training step; without it, networks fit the noise of rare
+            states. None: 0.4, or 0 if the state is a single factor: then states share no features, the network is in effect a
+            table, and dropout only adds noise.
+        sweeps: passes over all factors, with mask "others".
+        real_guess: whether sweeps start from the predictor's probabilities rather than from bits drawn from them.
         training: see TrainingConfig.
     """
 
@@ -54,14 +54,14 @@ class NeuralConfig:
     training: TrainingConfig = field(default_factory=TrainingConfig)
 
     def dropout_for(self, n_factors: int) -> float:
-        """The dropout share that is meant for states of ``n_factors`` factors."""
+        """The share of dropout for states of ``n_factors`` factors."""
         if self.dropout is not None:
             return self.dropout
         return 0.4 if n_factors > 1 else 0.0
 
     @classmethod
     def paper(cls, n_variables: int) -> NeuralConfig:
-        """Section 3's networks as they stand, for d = ``n_variables``: 2d + 1 and 2d^2 hidden nodes, sigmoids, squared error."""
+        """The networks of section 3, for d = ``n_variables``: 2d + 1 and 2d^2 hidden nodes, sigmoids, squared error."""
         return cls(
             hidden=(2 * n_variables + 1,),
             activation="sigmoid",
@@ -76,15 +76,15 @@ class NeuralConfig:
 
 
 BodyFactory: TypeAlias = Callable[[FactorCodec, torch.Generator], nn.Module]
-"""Builds a predictor body (see ``networks.Predictor``); all its first weights must come from the generator."""
+"""Builds a predictor body (see ``networks.Predictor``); all its initial weights must be drawn from the generator."""
 
 
 PRUNED = "pruned"
-"""An array of this name says that weights which are exactly 0 are connections that are gone; see ``tabulate.find_parents``."""
+"""An array of this name marks a pruned model, whose zero weights are removed connections; see ``truth_tables.find_parents``."""
 
 
 NO_MARKS = np.zeros((0, 0), dtype=np.int8)
-"""Of a model that has no tables."""
+"""Marks of a model without tables."""
 
 
 class NetworkPair(BaseTransitionModel):
@@ -94,9 +94,9 @@ class NetworkPair(BaseTransitionModel):
         cardinalities: number of values of each state factor, length F.
         n_actions: number of enumerated actions A of a single step.
         config: see NeuralConfig.
-        body: builds another predictor body than the dense one.
-        n_steps: actions in the string that is an action of this model (paper 4.2); see ``FactorCodec``.
-        seed: of the first weights; ``fit`` starts from its own seed's.
+        body: builds a predictor body other than the dense one.
+        n_steps: number of actions in the string that is one action of this model (paper 4.2); see ``FactorCodec``.
+        seed: seed of the initial weights; ``fit`` uses its own seed.
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class NetworkPair(BaseTransitionModel):
         self._build(seed)
 
     def _build(self, seed: int) -> torch.Generator:
-        """New networks; returns the generator that their weights came from."""
+        """Creates new networks; returns the generator from which their weights were drawn."""
         config, generator = self.config, torch.Generator().manual_seed(seed)
         self.predictor: nn.Module
         if self._body is not None:
@@ -169,7 +169,7 @@ class NetworkPair(BaseTransitionModel):
         """See TransitionModel.
 
         Raises:
-            ValueError: the arrays are not those of a model of this shape; nothing is changed then.
+            ValueError: the arrays are not those of a model of this shape; the model is unchanged.
         """
         wrong = self._misfit(state)
         if wrong:
@@ -206,9 +206,9 @@ class NetworkPair(BaseTransitionModel):
 
     @property
     def parents(self) -> NDArray[np.int8]:
-        """What each outcome bit of a pruned model hangs on, see ``tabulate.find_parents``; of any other model empty."""
+        """Parents of each outcome bit of a pruned model, see ``truth_tables.find_parents``; empty for any other model."""
         return self._marks
 
     def connections(self) -> dict[str, Connections]:
-        """The weights of each network, and which of them are left."""
+        """The connections of each network."""
         return {part: Connections(module, self._pruned) for part, module in self._parts().items()}

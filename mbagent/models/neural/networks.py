@@ -1,8 +1,8 @@
 """The networks of the paper's section 3: the predictor (3.1), also with shared weights on planes, and the conditioner (3.2).
 
 The paper's variables are bits; here a variable is a *factor* with any number of values (a bit is a factor with two), and
-termination is one more output factor, the last. On planes, weights are shared over positions (paper section 5): the effect of a
-wall is learned once, not once for every cell; for strings of actions (paper 4.2) the body is applied once per action.
+termination is an additional output factor, the last. On planes, weights are shared over positions (paper section 5), so the
+effect of a wall is learned once, not for every cell; for strings of actions (paper 4.2) the body is applied once per action.
 Shapes: B batch, F state factors, O = F + 1 output factors, K largest cardinality, G hidden nodes in a group.
 """
 
@@ -21,7 +21,7 @@ from torch.nn import functional
 from mbagent.spaces import PlaneLayout
 
 Mask: TypeAlias = Literal["causal", "others"]
-"""What output i of a conditioner sees of the next state: y_<i ("causal") or every y but y_i ("others", the paper's)."""
+"""Next factors that are inputs of a conditioner's output i: y_<i ("causal") or all but y_i ("others", the paper's)."""
 
 Activation: TypeAlias = Literal["sigmoid", "relu", "silu", "tanh"]
 
@@ -36,24 +36,24 @@ MASKED_LOGIT = -1e9
 """The logit of a value that a factor does not have."""
 
 RESIDUAL_START = 2.0
-"""Where the logit of "this factor stays as it is" starts: most variables of most worlds mostly do."""
+"""Initial logit of "this factor keeps its value", which is the most common case."""
 
 
 LARGE_GROUP = 2**15
-"""Hidden values of one group in a batch from which groups are computed one after another, each in the processor's cache:
-three times as fast as all at once then, and half as fast where groups are small."""
+"""Number of hidden values of one group in a batch from which groups are computed separately, each in the processor's cache:
+three times as fast as all at once for large groups, but half as fast for small ones."""
 
 
 class FactorCodec(nn.Module):
-    """Translates factors into network inputs, and columns of network outputs into logits.
+    """Converts factors to network inputs, and columns of network outputs to logits.
 
     A factor with two values is one 0/1 column, as in the paper; one with k > 2 values is k columns, one of them 1.
 
     Args:
         cardinalities: number of values of each state factor, length F.
         n_actions: number of enumerated actions A.
-        n_steps: actions in the string that is an action of the model (paper 4.2: "each action in the string occupies an
-            additional group of inputs"). The string's number has the first action as its lowest digit in base A.
+        n_steps: number of actions in the string that is one action of the model (paper 4.2: "each action in the string
+            occupies an additional group of inputs"). The first action is the lowest digit of the string's number in base A.
 
     Attributes:
         outputs: cardinalities of the O = F + 1 output factors; the last is ``terminated``.
@@ -95,11 +95,11 @@ class FactorCodec(nn.Module):
         return torch.cat((state, self.action_columns(actions)), dim=1)
 
     def action_columns(self, actions: Tensor) -> Tensor:
-        """Columns of the actions of a string, one-hot, step after step: float [B, n_steps * A] from int64 [B]."""
+        """One-hot columns of the actions of a string, in order: float [B, n_steps * A] from int64 [B]."""
         return torch.cat([self.single_actions[step] for step in self.action_steps(actions)], dim=1)
 
     def action_steps(self, actions: Tensor) -> list[Tensor]:
-        """The actions of a string, each int64 [B], the first first."""
+        """The actions of a string in order, each int64 [B]."""
         if self.n_steps == 1:
             return [actions]
         return [actions // self.n_actions**k % self.n_actions for k in range(self.n_steps)]
@@ -123,22 +123,22 @@ class FactorCodec(nn.Module):
 
 
 class Predictor(Protocol):
-    """What every predictor body is: an ``nn.Module`` that gives each output factor's logits from a state and an action."""
+    """Interface of predictor bodies: an ``nn.Module`` that computes each output factor's logits from a state and an action."""
 
     def __call__(self, states: Tensor, actions: Tensor) -> Tensor:
-        """Logits [B, O, K] from states int64 [B, F] and actions int64 [B]; values a factor lacks are at ``MASKED_LOGIT``."""
+        """Logits [B, O, K] from states int64 [B, F] and actions int64 [B]; ``MASKED_LOGIT`` for values a factor does not have."""
         ...
 
 
 class Affine(nn.Module):
-    """``nn.Linear`` that takes its first weights from a generator of its own, never from the process-wide one.
+    """``nn.Linear`` whose initial weights are drawn from a given generator instead of the process-wide one.
 
     Args:
         n_in: inputs.
         n_out: outputs.
         generator: source of the weights.
-        mask: bool [n_out, n_in], False where a weight is pruned: it is zero and gets no gradient. None: all there.
-        fan_in: connections of one output, for the size of the first weights (default: n_in).
+        mask: bool [n_out, n_in], False for pruned weights, which are zero and get no gradient. None: no weight is pruned.
+        fan_in: number of connections of one output, for the size of the initial weights (default: n_in).
     """
 
     def __init__(
@@ -165,12 +165,12 @@ class Affine(nn.Module):
 
 
 class Dropout(nn.Module):
-    """Zeroes a share of its inputs while a generator is set, and nothing otherwise.
+    """Dropout that is active only while a generator is set.
 
     ``nn.Dropout`` would draw from the process-wide generator. The trainer sets and removes ``generator``.
 
     Args:
-        share: of the inputs that is zeroed, 0 ... 1, to the nearest 1/256; the rest is scaled up to keep the mean.
+        share: share of the inputs that are zeroed, 0 ... 1, to the nearest 1/256; the others are scaled up to keep the mean.
     """
 
     def __init__(self, share: float) -> None:
@@ -182,14 +182,14 @@ class Dropout(nn.Module):
         """Values of the same shape."""
         if self.generator is None or self.share == 0.0:
             return values
-        # Eight bytes of a random word serve eight values: torch's own bernoulli_ would take a third of a training step.
+        # The eight bytes of a random word are used for eight values: bernoulli_ would take a third of a training step.
         words = torch.empty(values.numel() // 8 + 1, dtype=torch.int64).random_(-(2**63), None, generator=self.generator)
         kept = words.view(torch.uint8)[: values.numel()].view(values.shape) >= round(256 * self.share)
         return values * kept.to(values.dtype).mul_(1.0 / (1.0 - round(256 * self.share) / 256))
 
 
 class DensePredictor(nn.Module):
-    """The predictor network (paper 3.1): state and action in, each next factor's logits out, all connected to all.
+    """The predictor network (paper 3.1): a dense network from state and action to each next factor's logits.
 
     Args:
         codec: the factors.
@@ -197,7 +197,7 @@ class DensePredictor(nn.Module):
         activation: of the hidden nodes (the paper: sigmoid).
         residual: adds a learned path from each s_i to s'_i, one weight for each (action column, factor).
         dropout: share of hidden nodes zeroed in each training step.
-        generator: source of the first weights.
+        generator: source of the initial weights.
     """
 
     def __init__(
@@ -241,21 +241,20 @@ class DensePredictor(nn.Module):
 class Conditioner(nn.Module):
     """The conditioner network (paper 3.2): output i is the distribution of y_i given (s, a) and other next factors.
 
-    One hidden layer in groups, one group an output. Group i sees (s, a) and, of the next factors, y_<i (mask
-    "causal") or all but y_i (mask "others"); output i reads group i and nothing else, so nothing of y_i reaches
-    output i. Outputs that the predictor leaves no doubt about need no group: their logits are 0 here, and nothing
-    is added to the predictor's.
+    The hidden layer consists of groups, one for each output. The inputs of group i are (s, a) and, of the next factors, y_<i
+    (mask "causal") or all but y_i (mask "others"); output i depends only on group i, hence not on y_i. Outputs of which
+    the predictor is certain need no group: their logits are 0 here, so that the predictor's are unchanged.
 
     Args:
         codec: the factors.
-        mask: what a group sees.
+        mask: the next factors that are inputs of a group.
         group_size: hidden nodes G in a group (the paper: 2d, of 2d^2 + 1 in all).
         activation: of the hidden nodes.
-        correction: outputs start at zero, since they are added to the predictor's logits; False: they stand alone
+        correction: whether outputs are added to the predictor's logits, and thus start at zero; False: they are used alone
             (the paper).
         dropout: share of hidden nodes zeroed in each training step.
-        grouped: bool [O], which outputs have a group; None: all. Needs ``correction``.
-        generator: source of the first weights.
+        grouped: bool [O], outputs that have a group; None: all. Requires ``correction``.
+        generator: source of the initial weights.
     """
 
     def __init__(
@@ -293,7 +292,7 @@ class Conditioner(nn.Module):
         return self.from_columns(self.codec.inputs(states, actions), self.codec.targets(next_factors))
 
     def from_columns(self, inputs: Tensor, targets: Tensor) -> Tensor:
-        """Logits [B, O, K] from columns of (s, a) [B, n_inputs] and of the next factors [B, n_columns], bits or guesses."""
+        """Logits [B, O, K] from columns of (s, a) [B, n_inputs] and of the next factors [B, n_columns], bits or probabilities."""
         codec, n_groups = self.codec, len(self.members)
         columns = torch.cat((inputs, targets), dim=1)
         if len(columns) * self.group_size >= LARGE_GROUP:
@@ -310,7 +309,7 @@ class Conditioner(nn.Module):
         return values + codec.floor
 
     def _one_by_one(self, columns: Tensor) -> Tensor:
-        """The groups' outputs [B, g, n_values], group after group."""
+        """The groups' outputs [B, g, n_values], computed group by group."""
         groups, activation = self.groups, ACTIVATIONS[self.activation]
         weights = groups.weight if groups.mask is None else groups.weight * groups.mask
         values = [
@@ -327,7 +326,7 @@ class Conditioner(nn.Module):
 
 
 def group_mask(codec: FactorCodec, mask: Mask, group_size: int, outputs: Tensor) -> Tensor:
-    """Which inputs each hidden node of the groups of ``outputs`` sees: bool [groups * group_size, n_inputs + n_columns]."""
+    """Mask of the inputs of each hidden node in the groups of ``outputs``, bool [groups * group_size, n_inputs + n_columns]."""
     own = outputs[:, None]
     seen = codec.column_factor < own if mask == "causal" else codec.column_factor != own
     everything = torch.ones(len(outputs), codec.n_inputs, dtype=torch.bool)
@@ -340,23 +339,23 @@ def uniform(shape: Sequence[int], bound: float, generator: torch.Generator) -> T
 
 
 def _columns(cardinalities: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """The factor and the value that each column stands for, int64 [n_columns] each."""
+    """Factor and value of each column, int64 [n_columns] each."""
     pairs = [(f, v) for f, c in enumerate(cardinalities) for v in (range(c) if c != 2 else (1,))]
     factor, value = np.asarray(pairs, dtype=np.int64).reshape(-1, 2).T
     return np.ascontiguousarray(factor), np.ascontiguousarray(value)
 
 
 class PlanePredictor(nn.Module):
-    """Two 3x3 convolutions over the planes, each followed by a global maximum fed back to every position.
+    """Two 3x3 convolutions over the planes, each followed by a global maximum that is added at every position.
 
-    The border is seen through zero padding beside a plane of ones. The action enters every position. A learned residual
-    path leads from each cell to itself. ``terminated`` is read from the global maxima.
+    Borders are represented by zero padding of an additional plane of ones. The action is an input at every position. Each cell
+    has a learned residual path to itself. ``terminated`` is computed from the global maxima.
 
     Args:
         codec: the factors, one for each cell.
-        layout: where the cells lie.
-        channels: features at each position.
-        generator: source of the first weights.
+        layout: layout of the cells.
+        channels: number of features at each position.
+        generator: source of the initial weights.
     """
 
     def __init__(self, codec: FactorCodec, layout: PlaneLayout, channels: int = 16, *, generator: torch.Generator) -> None:
@@ -388,7 +387,7 @@ class PlanePredictor(nn.Module):
 
 
 def cells_of(states: Tensor, layout: PlaneLayout, codec: FactorCodec) -> Tensor:
-    """Planes float [B, C, H, W] of states int64 [B, F]; [B, C * K, H, W], one-hot, where cells have more than two values."""
+    """Planes float [B, C, H, W] of states int64 [B, F]; one-hot [B, C * K, H, W] if cells have more than two values."""
     if layout.channels_last:
         cells = states.view(-1, layout.height, layout.width, layout.channels).permute(0, 3, 1, 2)
     else:
@@ -411,7 +410,7 @@ def logits_of(planes: Tensor, end: Tensor, layout: PlaneLayout, codec: FactorCod
 
 
 class Convolution(nn.Module):
-    """``nn.Conv2d`` that keeps the size and takes its first weights from a generator of its own."""
+    """``nn.Conv2d`` that keeps the size and draws its initial weights from a given generator."""
 
     def __init__(self, n_in: int, n_out: int, size: int, generator: torch.Generator) -> None:
         super().__init__()
@@ -430,17 +429,17 @@ def maximum(planes: Tensor) -> Tensor:
 
 
 class PlaneStringPredictor(nn.Module):
-    """Features of each cell, carried on through one block for each action, and read out once at the end.
+    """Features of each cell, updated by one residual block for each action, with one output layer at the end.
 
-    A body that sees two cells around each cannot say what the world looks like many steps on. Here a block (two 3x3
-    convolutions and a global maximum, the same weights for every action of the string) is added to the features
-    as often as there are actions, so sight grows with the string while the number of weights does not.
+    A receptive field of two cells in each direction is too small for predictions over many steps. Here a block (two 3x3
+    convolutions and a global maximum, with the same weights for every action of the string) is applied once per action,
+    so the receptive field grows with the length of the string, while the number of weights does not.
 
     Args:
         codec: the factors, one for each cell; its ``n_steps`` is the length of the string.
-        layout: where the cells lie.
-        channels: features at each position.
-        generator: source of the first weights.
+        layout: layout of the cells.
+        channels: number of features at each position.
+        generator: source of the initial weights.
     """
 
     def __init__(self, codec: FactorCodec, layout: PlaneLayout, channels: int = 16, *, generator: torch.Generator) -> None:

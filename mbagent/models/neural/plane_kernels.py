@@ -1,6 +1,6 @@
-"""The plane predictor (``planes.py``) compiled: torch trains, numba samples.
+"""Compiled inference of the plane predictor (``networks.PlanePredictor``), which is trained by torch.
 
-Each row is computed by itself, so its result does not depend on the rows beside it. Shapes: C' input channels (planes,
+Each row is computed separately, so its result does not depend on the other rows. Shapes: C' input channels (planes,
 or planes times values), H rows, W columns, D hidden channels, A actions.
 """
 
@@ -20,10 +20,10 @@ Floats32 = NDArray[np.float32]
 
 
 class PlaneWeights(NamedTuple):
-    """A PlanePredictor's weights, laid out for the kernel.
+    """A PlanePredictor's weights in the layout of the kernel.
 
     Attributes:
-        row, column, channel: int64 [F], where each factor lies (channel of its value 0 where cells have many values).
+        row, column, channel: int64 [F], position of each factor (channel of its value 0 if cells have many values).
         values: 1 for binary cells, else K.
         first: [C', 3, 3, D]; base: [H, W, D], bias and border of the first layer; action: [A, D].
         second: [9 * D, D] (in, out); second_bias: [D]; second_top: [D, D] (in, out).
@@ -103,7 +103,7 @@ def plane_logits(states: Ints, actions: Ints, w: PlaneWeights, width: int) -> Fl
         if b == 0 or not _same(states, b):
             _first_layer(states[b], w, plain)
         _activate_first(plain, w.action[actions[b]], padded, patches, top)
-        # One product for each state: in a product for several, some processors round a row by its place among them.
+        # One product for each state: in a product for several, the rounding of a row can depend on its position.
         np.dot(patches, w.second, above)
         _mix(top, w.second_top, w.second_bias, bias)
         _activate_second(above, bias, top)
@@ -119,13 +119,13 @@ def plane_logits(states: Ints, actions: Ints, w: PlaneWeights, width: int) -> Fl
 
 @compiled
 def _same(states: Ints, b: int) -> bool:
-    """Whether row b is the state of the row before it: its first layer is then known but for the action."""
+    """Whether row b has the same state as the previous row, so that its first layer differs only by the action."""
     return bool((states[b] == states[b - 1]).all())
 
 
 @compiled
 def _first_layer(state: Ints, w: PlaneWeights, plain: Floats32) -> None:
-    """First convolution without the action: only cells that are on are worth a multiplication."""
+    """First convolution without the action, summed over the cells that are 1."""
     height, columns, hidden = plain.shape
     plain[:] = w.base
     for f in range(len(state)):
@@ -146,10 +146,10 @@ def _first_layer(state: Ints, w: PlaneWeights, plain: Floats32) -> None:
 
 @compiled
 def _activate_first(plain: Floats32, action: Floats32, padded: Floats32, patches: Floats32, top: Floats32) -> None:
-    """Switches the action on, and writes each position's 3x3 neighbourhood to a row of ``patches`` [H * W, 9 * D].
+    """Adds the action, and writes each position's 3x3 neighbourhood to a row of ``patches`` [H * W, 9 * D].
 
-    ``padded`` [(H + 2) * (W + 2) * D] holds the activations with a border of zeros: three neighbours in a row lie side
-    by side there, so a patch is three runs of 3 * D numbers.
+    ``padded`` [(H + 2) * (W + 2) * D] contains the activations with a border of zeros: three neighbours in a row are
+    contiguous there, so a patch consists of three runs of 3 * D numbers.
     """
     height, columns, hidden = plain.shape
     top[:] = 0.0

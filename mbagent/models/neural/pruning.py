@@ -1,11 +1,11 @@
-"""Pruning of predictor and conditioner: by size with retraining (paper section 5), then by evidence.
+"""Pruning of predictor and conditioner: by magnitude with retraining (paper section 5), then by the extended BIC.
 
-Among the weights that pruning by size leaves, some only fit noise: a variable that is a fair coin keeps dozens of weak causes. A
-connection stays only if removing it costs more nats on the observed transitions than half the logarithm of their number (Schwarz
-1978, "Estimating the dimension of a model") and the logarithm of the number of inputs it was chosen from, since the best of many
-gains is large by chance (Chen and Chen 2008, "Extended Bayesian information criteria for model selection with large model
-spaces"). Each is judged with the rest of the network as it is; its mean contribution goes to the bias.
-Shapes: N rows, C output columns of a network, H hidden nodes, I inputs, F factors that the columns stand for.
+Some of the weights that remain after pruning by magnitude only fit noise: a fair coin keeps dozens of weak parents. A connection
+is kept only if its removal increases the loss on the observed transitions, in nats, by more than half the logarithm of their
+number (Schwarz 1978, "Estimating the dimension of a model") plus the logarithm of the number of candidate inputs, since the best
+of many gains is large by chance (Chen and Chen 2008, "Extended Bayesian information criteria for model selection with large model
+spaces"). Each connection is tested with the rest of the network fixed; its mean contribution is added to the bias.
+Shapes: N rows, C output columns of a network, H hidden nodes, I inputs, F factors of the columns.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from mbagent.models.neural.training import Examples, Trainer
 from mbagent.types import Progress
 
 PRUNING_ROWS = 20_000
-"""Transitions that are looked at, at most; what they cost is scaled up to all of them."""
+"""Largest number of transitions on which losses are computed; the losses are scaled up to all transitions."""
 
 
 class Judge:
-    """Knows what a network says about transitions, and whether it may say something else instead.
+    """Decides whether changes of a network's output on transitions are acceptable.
 
     Args:
         rows: the transitions.
-        factor: that each column stands for, int64 [C]; a bit has one column, which is the logit of 1.
-        logits: of the columns, [N, C]; kept up to date.
-        n_transitions: that the rows stand for.
-        n_candidates: inputs that each connection was chosen from; both set how much it has to be worth.
+        factor: factor of each column, int64 [C]; a bit has one column, the logit of value 1.
+        logits: logits of the columns, [N, C]; updated by accepted changes.
+        n_transitions: number of transitions that the rows represent.
+        n_candidates: number of candidate inputs of each connection; both numbers determine the penalty per connection.
     """
 
     def __init__(self, rows: Examples, factor: Tensor, logits: Tensor, n_transitions: int, n_candidates: int) -> None:
@@ -46,13 +46,13 @@ class Judge:
         self.price = (0.5 * math.log(max(n_transitions, 2)) + math.log(max(n_candidates, 1))) / max(n_transitions, 1)
 
     def _nats(self, factor: int, logits: Tensor) -> float:
-        """Mean loss on a factor whose columns are at ``logits`` [N, its columns]."""
+        """Mean loss of a factor whose columns have the ``logits`` [N, its columns]."""
         outcome = self.outcomes[:, factor]
         if logits.shape[1] == 1:
-            lost = functional.softplus(logits[:, 0]) - logits[:, 0] * outcome
+            losses = functional.softplus(logits[:, 0]) - logits[:, 0] * outcome
         else:
-            lost = functional.cross_entropy(logits, outcome, reduction="none")
-        return float(torch.dot(lost, self.weights))
+            losses = functional.cross_entropy(logits, outcome, reduction="none")
+        return float(torch.dot(losses, self.weights))
 
     def mean(self, values: Tensor) -> Tensor:
         """The weighted mean over rows of ``values`` [N, ...]."""
@@ -64,7 +64,7 @@ class Judge:
         return self.mean((values - self.mean(values)) ** 2).sqrt()
 
     def accepts(self, columns: Tensor, change: Tensor, connections: int = 1) -> bool:
-        """Whether adding ``change`` [N, c] to the given columns costs less than the connections are worth; if so, it is done."""
+        """Whether adding ``change`` [N, c] to the columns increases the loss by less than the penalty; if so, it is applied."""
         proposed, found, cost, price = self.logits[:, columns] + change, {}, 0.0, connections * self.price
         place = {int(c): k for k, c in enumerate(columns)}
         for factor in {int(f) for f in self.factor[columns]}:
@@ -80,14 +80,14 @@ class Judge:
 
 @dataclass
 class Layers:
-    """A hidden layer and the columns that come out of it, changed in place.
+    """A hidden layer and its output columns, modified in place.
 
     Attributes:
         inputs: [N, I].
-        first, bias: of the hidden layer, [H, I] and [H].
-        last, last_bias: of the columns, [C, H] and [C].
-        activation: of the hidden layer.
-        columns: places of its C columns among the judge's.
+        first, bias: weights of the hidden layer, [H, I] and [H].
+        last, last_bias: weights of the columns, [C, H] and [C].
+        activation: activation of the hidden layer.
+        columns: indices of the C columns among those of the Judge.
     """
 
     inputs: Tensor
@@ -99,7 +99,7 @@ class Layers:
     columns: Tensor
 
     def trim(self, judge: Judge) -> bool:
-        """Removes what is not called for, and all that leads into nothing; returns whether anything went."""
+        """Removes unsupported connections and those without a path to an output; returns whether any were removed."""
         before = self._left()
         hidden = self.activation(self.inputs @ self.first.T + self.bias)
         trim_layer(hidden, self.last, self.last_bias, self.columns, judge)
@@ -112,13 +112,13 @@ class Layers:
         return self._left() < before
 
     def trim_past(self, i: int, paths: Tensor, weight: Tensor, judge: Judge) -> bool:
-        """Removes all from input i to column i at once, through nodes and past them: there are pairs that cancel each other.
+        """Removes all paths from input i to column i at once, direct ones and those through nodes, which may cancel each other.
 
         Args:
-            i: place of the input, and of the column.
-            paths: values of the A connections past the nodes, [N, A].
+            i: index of the input and of the column.
+            paths: values of the A direct connections, [N, A].
             weight: their weights, [1, A].
-            judge: of the change.
+            judge: decides on the change.
         """
         nodes = torch.nonzero((self.first[:, i] != 0.0) & (self.last[i] != 0.0))[:, 0]
         count = len(nodes) + int((weight != 0.0).sum())
@@ -143,7 +143,7 @@ class Layers:
         return int((self.first != 0.0).sum() + (self.last != 0.0).sum())
 
     def _trim_node(self, h: int, means: Tensor, spread: Tensor, judge: Judge) -> None:
-        """The connections into a hidden node, the weakest first."""
+        """Tests the connections into a hidden node, the weakest first."""
         to = torch.nonzero(self.last[:, h])[:, 0]
         sums = self.inputs @ self.first[h] + self.bias[h]
         given = self.activation(sums)
@@ -158,7 +158,7 @@ class Layers:
 
 
 def trim_layer(inputs: Tensor, weight: Tensor, bias: Tensor, columns: Tensor, judge: Judge) -> None:
-    """Removes connections [C, I] from ``inputs`` [N, I] straight to columns, the weakest first; changes weight and bias [C]."""
+    """Tests direct connections [C, I] from ``inputs`` [N, I] to columns, weakest first; modifies ``weight`` and ``bias`` [C]."""
     means, spread = judge.mean(inputs), judge.spread(inputs)
     centred = inputs - means
     for row in range(len(columns)):
@@ -169,7 +169,7 @@ def trim_layer(inputs: Tensor, weight: Tensor, bias: Tensor, columns: Tensor, ju
 
 
 def _weakest_first(weights: Tensor, spread: Tensor) -> list[int]:
-    """Places of the weights that are not 0, by how much they move what they lead to."""
+    """Indices of the non-zero weights, by the standard deviation of their contribution."""
     places: list[int] = torch.nonzero(weights)[:, 0].tolist()
     sizes = (weights.abs() * spread).tolist()
     return sorted(places, key=sizes.__getitem__)
@@ -177,12 +177,12 @@ def _weakest_first(weights: Tensor, spread: Tensor) -> list[int]:
 
 @torch.no_grad()
 def trim_predictor(predictor: DensePredictor, rows: Examples, n_transitions: int) -> None:
-    """Removes what the transitions do not call for: residual paths, the last hidden layer, and what comes out of it.
+    """Removes unsupported connections: residual paths, and those into and out of the last hidden layer.
 
     Args:
-        predictor: changed in place.
+        predictor: the predictor, modified in place.
         rows: distinct transitions.
-        n_transitions: that they stand for.
+        n_transitions: number of transitions that they represent.
     """
     rows, codec, out = rows.spread(PRUNING_ROWS), predictor.codec, predictor.out
     inputs = values = codec.inputs(rows.states, rows.actions)
@@ -190,8 +190,8 @@ def trim_predictor(predictor: DensePredictor, rows: Examples, n_transitions: int
     activation = ACTIVATIONS[predictor.activation]
     for layer in layers[:-1]:
         values = activation(layer(values))
-    said = _columns(codec, predictor(rows.states, rows.actions))
-    judge = Judge(rows, codec.column_factor, said, n_transitions, codec.n_inputs)
+    logits = _columns(codec, predictor(rows.states, rows.actions))
+    judge = Judge(rows, codec.column_factor, logits, n_transitions, codec.n_inputs)
     everything = torch.arange(codec.n_columns)
     last = None
     if layers:
@@ -208,12 +208,12 @@ def trim_predictor(predictor: DensePredictor, rows: Examples, n_transitions: int
     while last is not None and last.trim(judge):
         pass
     for above, layer in zip(layers[:0:-1], layers[-2::-1], strict=True):
-        layer.weight[(above.weight == 0.0).all(dim=0)] = 0.0  # they lead to nothing
+        layer.weight[(above.weight == 0.0).all(dim=0)] = 0.0  # nodes without a path to an output
 
 
 @torch.no_grad()
 def trim_conditioner(conditioner: Conditioner, predictor: nn.Module, rows: Examples, n_transitions: int) -> None:
-    """The same for each of a conditioner's groups, given what the predictor says. Arguments as above."""
+    """As ``trim_predictor``, for each group of a conditioner, given the predictor's output."""
     rows, codec, size = rows.spread(PRUNING_ROWS), conditioner.codec, conditioner.group_size
     columns = torch.cat((codec.inputs(rows.states, rows.actions), codec.targets(rows.outcomes)), dim=1)
     logits = conditioner(rows.states, rows.actions, rows.outcomes)
@@ -234,18 +234,18 @@ def trim_conditioner(conditioner: Conditioner, predictor: nn.Module, rows: Examp
 
 
 def _columns(codec: FactorCodec, logits: Tensor) -> Tensor:
-    """Columns [N, C] of logits [N, O, K]: what ``codec.logits`` made them of."""
+    """Columns [N, C] of logits [N, O, K]; the inverse of ``codec.logits``."""
     return logits.flatten(1)[:, codec.slots].clone()
 
 
 BATCHES = 0x9F
-"""Added to the seed of the batches: they are not those of the fit before."""
+"""Added to the seed, so that the batches differ from those of the fit."""
 
 PRUNING_ROUNDS = 3
-"""How often what the data do not call for goes; what is left says it more clearly each time that it is trained again."""
+"""Number of rounds of removal by the extended BIC; retraining after each round makes further removals possible."""
 
 SETTLE, RATE = 600, 0.25
-"""Steps of training after each time, and share of the learning rate."""
+"""Training steps after each round, and their share of the learning rate."""
 
 
 def prune_networks(
@@ -259,17 +259,17 @@ def prune_networks(
     progress: Progress | None,
     config: PruningConfig | None,
 ) -> float:
-    """Prunes the predictor, then the conditioner, which corrects what the pruned predictor says; returns epochs done.
+    """Prunes the predictor, then the conditioner, which corrects the pruned predictor; returns the number of epochs.
 
     Args:
-        trainer: of the networks.
-        connections: of "predictor" and, where there is one, "conditioner".
-        fraction: of each network's connections that are gone in the end.
-        train: to train on.
-        held_out: to choose the best weights by.
-        n_transitions: that the rows to train on stand for.
-        seed: of the batches.
-        progress: is told the share done.
+        trainer: trainer of the networks.
+        connections: connections of "predictor" and, if there is one, "conditioner".
+        fraction: smallest share of each network's connections to be removed.
+        train: training examples.
+        held_out: examples for the selection of the best weights.
+        n_transitions: number of transitions that the training examples represent.
+        seed: seed of the batches.
+        progress: called with the completed share.
         config: see PruningConfig.
     """
     config, generator = config or PruningConfig(), torch.Generator().manual_seed(seed + BATCHES)
@@ -280,7 +280,7 @@ def prune_networks(
     if isinstance(predictor, DensePredictor):
         for _ in range(PRUNING_ROUNDS * config.evidence):
             trim_predictor(predictor, train, n_transitions)
-            epochs += _settle(trainer).fit(train, held_out, generator, None, _as_left(predictor))
+            epochs += _settle(trainer).fit(train, held_out, generator, None, _keep_removed(predictor))
     if not both or conditioner is None:
         return epochs
     half = None if progress is None else lambda share: progress(0.5 + 0.5 * share)
@@ -288,17 +288,17 @@ def prune_networks(
     epochs += trainer.fit_conditioner(train, held_out, generator, half, shrinking)
     for _ in range(PRUNING_ROUNDS * config.evidence):
         trim_conditioner(conditioner, predictor, train, n_transitions)
-        epochs += _settle(trainer).fit_conditioner(train, held_out, generator, None, _as_left(conditioner))
+        epochs += _settle(trainer).fit_conditioner(train, held_out, generator, None, _keep_removed(conditioner))
     return epochs
 
 
 def _settle(trainer: Trainer) -> Trainer:
-    """A trainer of the same networks that trains them for a short while, at a low rate."""
+    """A trainer of the same networks with few steps and a low learning rate."""
     config = trainer.config
     short = replace(config, min_steps=SETTLE, max_steps=SETTLE, learning_rate=RATE * config.learning_rate)
     return Trainer(trainer.codec, trainer.predictor, trainer.conditioner, short)
 
 
-def _as_left(module: nn.Module) -> Shrinking:
-    """Keeps what is gone at 0."""
+def _keep_removed(module: nn.Module) -> Shrinking:
+    """A Shrinking that removes no more connections, but keeps removed ones at 0."""
     return Shrinking(Connections(module, zeros_gone=True), 0.0, PruningConfig(gradual=False))

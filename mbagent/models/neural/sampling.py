@@ -1,14 +1,14 @@
-"""Sampling from predictor and conditioner (paper 3.1 and 3.2), compiled; every row draws from its own key.
+"""Compiled sampling from predictor and conditioner (paper 3.1 and 3.2); every row uses its own key.
 
 Three samplers: each factor independently (no conditioner), ancestral (conditioner masked to y_<i; exact), and the paper's sweeps
-(conditioner masked to all but y_i; in ``gibbs.py``). For planning, successors are listed where they are few; else they are
-systematic draws. Main particles hold the grid points (j + offset) / n of [0, 1). At each factor a particle's interval is split in
-proportion to P(y_i | s, a, y_<i) and its points go to the parts; parts without a point are dropped. So work grows with the number
-of different outcomes and not with n. The offset is the same for all rows: two actions, or two states, differ by their effects and
-not by chance. A particle with a single point continues with fresh numbers, hashed from (seed, point, factor), since its interval
-would soon be too narrow for a float.
-Shapes: B batch, F state factors, O = F + 1 output factors, K largest cardinality, n points a row, M successors. Rows of arrays
-are addressed by index, not sliced: a slice costs more than the work done with it here.
+(conditioner masked to all but y_i; in ``gibbs.py``). For planning, successors are listed if they are few; otherwise they are
+obtained by systematic sampling. Main particles contain the grid points (j + offset) / n of [0, 1). At each factor a particle's
+interval is split in proportion to P(y_i | s, a, y_<i) and its points are distributed to the parts; parts without a point are
+dropped. So the work grows with the number of distinct outcomes and not with n. The offset is the same for all rows, so that
+actions or states differ only by their effects. A particle with a single point continues with new random numbers, hashed from
+(seed, point, factor), since its interval would soon be too narrow for a float.
+Shapes: B batch, F state factors, O = F + 1 output factors, K largest cardinality, n points per row, M successors. Rows of arrays
+are addressed by index, not sliced, since creating a slice takes longer than the work done with it here.
 """
 
 from __future__ import annotations
@@ -61,11 +61,11 @@ class Work(NamedTuple):
     """Work space for one row.
 
     Attributes:
-        columns: those that are on, int64 [2 * O + n_steps].
-        noise: a number for each factor, [O].
+        columns: columns that are 1, int64 [2 * O + n_steps].
+        noise: random number of each factor, [O].
         sums: input of one group, [1, G].
-        row_logits: of one factor, [K].
-        given: its distribution, [K].
+        row_logits: logits of one factor, [K].
+        given: distribution of that factor, [K].
     """
 
     columns: Ints
@@ -77,7 +77,7 @@ class Work(NamedTuple):
 
 @compiled
 def work_space(layout: Layout, group: GroupWeights) -> Work:
-    """Room for one row of a model of this shape."""
+    """Work space for one row of a model of this shape."""
     n_outputs, size, n_values = len(layout.outputs), group.bias.shape[1], group.offset.shape[1]
     return Work(
         np.empty(2 * n_outputs + layout.n_steps, dtype=np.int64),
@@ -90,7 +90,7 @@ def work_space(layout: Layout, group: GroupWeights) -> Work:
 
 @inlined
 def draw_at(probs: Floats, b: int, i: int, n: int, u: float) -> int:
-    """As ``draw``, from ``probs[b, i]``."""
+    """As ``systematic_sampling.draw``, from ``probs[b, i]``."""
     chosen = 0
     for k in range(n):
         if probs[b, i, k] > 0.0:
@@ -103,7 +103,7 @@ def draw_at(probs: Floats, b: int, i: int, n: int, u: float) -> int:
 
 @inlined
 def _likeliest(values: Floats, n: int) -> int:
-    """Index of the largest of the first ``n`` values; the lowest of equals."""
+    """Index of the largest of the first ``n`` values; the lowest index in a tie."""
     best = 0
     for k in range(1, n):
         if values[k] > values[best]:
@@ -113,12 +113,12 @@ def _likeliest(values: Floats, n: int) -> int:
 
 @compiled
 def sample_independent(probs: Floats, outputs: Ints, keys: Keys) -> Ints:
-    """Draws int64 [B, O]: factor i of row b at number i of key b."""
+    """Samples int64 [B, O]: factor i of row b uses number i of key b."""
     factors = np.empty(probs.shape[:2], dtype=np.int64)
     for b in range(probs.shape[0]):
         for i in range(probs.shape[1]):
             u = uniform_at(keys[b], i)
-            if outputs[i] == 2:  # written out: bits are the common case
+            if outputs[i] == 2:  # special case for bits, the most common factors
                 factors[b, i] = 1 if u >= probs[b, i, 0] and probs[b, i, 1] > 0.0 else 0
             else:
                 factors[b, i] = draw_at(probs, b, i, outputs[i], u)
@@ -137,11 +137,11 @@ def sample_causal(
     certain: float,
     greedy: bool,
 ) -> Ints:
-    """Ancestral draws int64 [B, O]: y_0, then y_1 given it, and so on; ``greedy`` takes the likeliest each time instead.
+    """Ancestral samples int64 [B, O]: y_0, then y_1 given y_0, and so on; ``greedy`` takes the most likely values instead.
 
-    A factor whose likeliest value has at least ``certain`` in the predictor's eyes, or that has no group in the
-    conditioner, is drawn from the predictor. This is part of the model: ``log_prob_causal`` follows the same rule, so
-    both stay exact.
+    A factor whose most likely value has at least the probability ``certain`` by the predictor, or that has no group in the
+    conditioner, is sampled from the predictor. This is part of the model: ``log_prob_causal`` follows the same rule, so
+    both are exact.
 
     Args:
         states: int64 [B, F].
@@ -151,8 +151,8 @@ def sample_causal(
         keys: uint64 [B].
         layout: the factors.
         group: the conditioner, masked "causal".
-        certain: as said above.
-        greedy: as said above.
+        certain: see above.
+        greedy: see above.
     """
     factors = np.empty((len(states), len(layout.outputs)), dtype=np.int64)
     work = work_space(layout, group)
@@ -177,7 +177,7 @@ def _causal_row(
     factors: Ints,
 ) -> None:
     """Row b of ``sample_causal``, to ``factors`` [B, O]."""
-    # The caller keeps all of this alive: no references need be counted for every factor.
+    # The caller keeps all arrays alive, so that reference counting for every factor can be avoided.
     states, logits, probs, factors = borrowed(states), borrowed(logits), borrowed(probs), borrowed(factors)
     layout, group, w = borrowed(layout), borrowed(group), borrowed(work)
     fill_row(key, w.noise)
@@ -185,7 +185,7 @@ def _causal_row(
     for i in range(len(layout.outputs)):
         n, u = layout.outputs[i], w.noise[i]
         if trusted(probs, b, i, layout, group, certain):
-            if n == 2:  # written out, as in sample_independent
+            if n == 2:  # special case, as in sample_independent
                 value = int((0.5 if greedy else u) >= probs[b, i, 0] and probs[b, i, 1] > 0.0)
             else:
                 value = largest(probs, b, i, n) if greedy else draw_at(probs, b, i, n, u)
@@ -199,7 +199,7 @@ def _causal_row(
 
 @inlined
 def _condition(b: int, i: int, logits: Floats32, layout: Layout, group: GroupWeights, n_columns: int, w: Work) -> None:
-    """Writes factor i's distribution, given the columns that are on, to ``w.given``."""
+    """Writes factor i's distribution, given the columns that are 1, to ``w.given``."""
     g = group.group_of[i]
     copy_row(group.bias, g, w.sums, 0)
     add_columns(group.columns, g, w.columns, n_columns, w.sums, 0)
@@ -217,7 +217,7 @@ def log_prob_causal(
     group: GroupWeights,
     certain: float,
 ) -> Floats:
-    """Log-probability [B] of the outcomes ``factors`` [B, O] under exactly what ``sample_causal`` draws."""
+    """Log-probability [B] of the outcomes ``factors`` [B, O] under the distribution of ``sample_causal``."""
     result, work = np.zeros(len(states), dtype=np.float64), work_space(layout, group)
     for b in range(len(states)):
         n_columns, place = active_columns(states, b, actions[b], layout, work.columns), 0
@@ -260,7 +260,7 @@ def _independent(probs: Floats, outputs: Ints, grid: Grid) -> Found:
 
 @compiled
 def _fits(probs: Floats, b: int, outputs: Ints, base: Ints, n_grid: int) -> bool:
-    """Whether all outcomes of row b can be listed, by its factors that are still open in ``base`` [O]."""
+    """Whether all outcomes of row b can be listed, given the factors that are open in ``base`` [O]."""
     n = 1
     for i in range(len(outputs)):
         if base[i] < 0:
@@ -288,7 +288,7 @@ def _causal(
     p, found = new_particles(n_grid, n_outputs, probs.shape[2]), room(len(states), n_grid, n_outputs)
     base, still_open, columns = np.empty((3, n_outputs), dtype=np.int64)
     active = np.empty(n_outputs + layout.n_steps, dtype=np.int64)
-    sums = np.empty((2, group.bias.shape[1]), dtype=np.float32)  # of what all particles share; of one particle
+    sums = np.empty((2, group.bias.shape[1]), dtype=np.float32)  # shared by all particles; of one particle
     row_logits, hidden = np.empty(probs.shape[2], dtype=np.float32), np.empty((1, group.bias.shape[1]), dtype=np.float32)
     values, total = np.empty(probs.shape[2], dtype=np.float64), 0
     for b in range(len(states)):
@@ -330,7 +330,7 @@ def _causal(
 def _known_input(
     i: int, base: Ints, active: Ints, n_active: int, layout: Layout, group: GroupWeights, columns: Ints, sums: Floats32
 ) -> None:
-    """Writes to ``sums[0]`` what factor i's group gets in all particles of a row: from (s, a), and earlier factors they share."""
+    """Writes to ``sums[0]`` the input of factor i's group that all particles of a row share: from (s, a) and settled factors."""
     g, n = group.group_of[i], 0
     for j in range(i):
         if base[j] >= 0 and (layout.outputs[j] != 2 or base[j] == 1):
@@ -345,7 +345,7 @@ def _known_input(
 def _open_columns(
     factors: Ints, q: int, still_open: Ints, n_open: int, layout: Layout, group: GroupWeights, columns: Ints
 ) -> int:
-    """Writes the columns that are 1 by the open factors of particle ``q``; returns how many."""
+    """Writes the columns that are 1 for the open factors of particle ``q``; returns their number."""
     n = 0
     for w in range(n_open):
         j, value = still_open[w], factors[q, w]
@@ -361,8 +361,8 @@ def independent_successors(probs: Floats, outputs: Ints, n_samples: int, seed: i
     Args:
         probs: float64 [B, O, K], each factor's distribution.
         outputs: int64 [O], cardinalities; the last factor is ``terminated``.
-        n_samples: grid points n a row.
-        seed: which grid offset and fresh numbers.
+        n_samples: grid points n per row.
+        seed: seed of the grid's offset and of new random numbers.
     """
     key, offset = start(seed)
     step = rows_at_once(n_samples, len(outputs))
@@ -384,7 +384,7 @@ def causal_successors(
 ) -> Successors:
     """Successors under a compiled causal conditioner.
 
-    Arguments are those of ``samplers.sample_causal``, and ``n_samples`` and ``seed`` as above.
+    Arguments are those of ``sample_causal``, and ``n_samples`` and ``seed`` of ``independent_successors``.
     """
     key, offset = start(seed)
     step = rows_at_once(n_samples, len(layout.outputs))

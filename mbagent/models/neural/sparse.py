@@ -1,6 +1,6 @@
-"""What is left of a pruned predictor and causal conditioner of bits, as lists of connections instead of matrices of zeros.
+"""A pruned predictor and causal conditioner of bits as lists of connections instead of matrices.
 
-Only hidden nodes that lead to one of the bits asked for are there; a bit that is set adds the few weights that lead from it.
+Only hidden nodes with a path to one of the requested bits are included; each input bit that is 1 adds its few weights.
 Shapes: F bits of a state, O = F + 1 of an outcome (``terminated`` last), A actions, H hidden nodes of the predictor, G of all
 groups of the conditioner.
 """
@@ -21,16 +21,16 @@ from mbagent.types import Bools, Floats, Ints
 from mbagent_envs.jit import compiled, inlined
 
 SURE_LOGIT = math.log(1e6)
-"""A logit further from 0 is sure."""
+"""A logit with a larger absolute value is treated as certain."""
 
 
 class Links(NamedTuple):
-    """Connections of some things, one thing's after the other's.
+    """Connections grouped by one of their ends (a compressed sparse row matrix).
 
     Attributes:
-        begin: where those of each thing begin, and at last where all end, int64 [things + 1].
-        other: what each of them leads to or comes from, int64.
-        weight: of each of them.
+        begin: index of the first connection of each row, and the end of the last row, int64 [rows + 1].
+        other: the other end of each connection, int64.
+        weight: weight of each connection.
     """
 
     begin: Ints
@@ -42,9 +42,9 @@ class SparseGroups(NamedTuple):
     """The conditioner's connections.
 
     Attributes:
-        begin: where the nodes of each outcome bit's group begin, int64 [O + 1].
+        begin: index of the first node of each outcome bit's group, int64 [O + 1].
         links: into each node, from columns: state bits, actions, outcome bits.
-        bias: of the nodes, [G].
+        bias: bias of the nodes, [G].
         readout: from each node to its group's bit, [G].
         offset: of each bit's group, [O].
         grouped: whether an outcome bit has a group, bool [O].
@@ -64,15 +64,15 @@ class SparseNetworks(NamedTuple):
     """The two networks' connections.
 
     Attributes:
-        asked: whether each outcome bit is the networks' to tell, bool [O].
+        asked: whether each outcome bit is predicted by the networks, bool [O].
         inputs: from each state bit and action to hidden nodes.
-        bias: of the hidden nodes, [H].
+        bias: bias of the hidden nodes, [H].
         outputs: into each outcome bit, from hidden nodes.
         output_bias: [O].
-        stay: the residual path's weight, [A, F].
-        activation: of all nodes; see ``arithmetic``.
+        stay: weights of the residual path, [A, F].
+        activation: code of the activation of all nodes; see ``kernels``.
         groups: the conditioner.
-        certain: a bit whose logit is at least this far from 0 is left to the predictor.
+        certain: a bit whose logit has at least this absolute value is sampled from the predictor.
     """
 
     asked: Bools
@@ -89,13 +89,13 @@ class SparseNetworks(NamedTuple):
 def pack_sparse(
     predictor: DensePredictor, conditioner: Conditioner | None, certain: float, asked: Bools
 ) -> SparseNetworks | None:
-    """The connections that the bits ``asked`` for need; None where the predictor has not one hidden layer.
+    """The connections required for the requested bits; None unless the predictor has exactly one hidden layer.
 
     Args:
-        predictor: of bits and single actions.
-        conditioner: causal, or none.
-        certain: from which probability on the predictor is trusted.
-        asked: bool [O].
+        predictor: a predictor of bits and single actions.
+        conditioner: a causal conditioner, or None.
+        certain: probability from which on the predictor is trusted.
+        asked: requested outcome bits, bool [O].
     """
     layers = [layer for layer in predictor.layers if isinstance(layer, Affine)]
     if len(layers) != 1:
@@ -121,7 +121,7 @@ def pack_sparse(
 
 
 def n_links(k: SparseNetworks) -> int:
-    """How many connections there are."""
+    """Number of connections."""
     return sum(len(links.weight) for links in (k.inputs, k.outputs, k.groups.links))
 
 
@@ -141,7 +141,7 @@ def _groups(conditioner: Conditioner | None, asked: Bools, n_columns: int) -> Sp
 
 
 def _links(weight: Floats32) -> Links:
-    """The weights that are not 0, row after row."""
+    """The non-zero weights, row by row."""
     matrix = csr_matrix(weight)
     return Links(matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64), matrix.data.astype(np.float32))
 
@@ -155,11 +155,11 @@ class Room(NamedTuple):
     """Work space.
 
     Attributes:
-        sums: what the state gives to the hidden nodes, [H].
+        sums: the state's contribution to the hidden nodes, [H].
         hidden: their values, [H].
         logits: the predictor's, [O].
         chances: the predictor's P(bit = 1), [O].
-        conditioned: whether the bit is its group's to tell, which must be asked, bool [O].
+        conditioned: whether the bit is predicted by its group, which must then be evaluated, bool [O].
         nodes: values of a group's nodes.
     """
 
@@ -173,7 +173,7 @@ class Room(NamedTuple):
 
 @compiled
 def room_for(k: SparseNetworks | None) -> Room:
-    """Work space for networks; nothing for none. Numba leaves out at once what is asked of none, here and below."""
+    """Work space for networks; empty for None. Here and below, numba removes the branches for None at compile time."""
     n_hidden, n_outputs, n_nodes = 0, 0, 0
     if k is not None:
         n_hidden, n_outputs, n_nodes = len(k.bias), len(k.asked), len(k.groups.readout)
@@ -189,14 +189,14 @@ def room_for(k: SparseNetworks | None) -> Room:
 
 @inlined
 def _add_input(column: int, sums: Floats32, begin: Ints, other: Ints, weight: Floats32) -> None:
-    """Adds what a state bit that is 1, or an action, gives to the hidden nodes' sums [H]."""
+    """Adds the weights of a state bit that is 1, or of an action, to the hidden nodes' sums [H]."""
     for v in range(begin[column], begin[column + 1]):
         sums[other[v]] += weight[v]
 
 
 @compiled
 def see_state(k: SparseNetworks | None, room: Room, state: Ints) -> None:
-    """Sums up what a state int64 [F] gives to the hidden nodes."""
+    """Computes the contribution of a state int64 [F] to the hidden nodes."""
     if k is None:
         return
     sums, bias = room.sums, k.bias
@@ -210,7 +210,7 @@ def see_state(k: SparseNetworks | None, room: Room, state: Ints) -> None:
 
 @inlined
 def _chance(logit: float) -> float:
-    """The logistic function, in double precision; 0 or 1 where it is next to that."""
+    """The logistic function, in double precision; rounded to 0 or 1 beyond ``SURE_LOGIT``."""
     if abs(logit) > SURE_LOGIT:
         return 1.0 if logit > 0.0 else 0.0
     return 1.0 / (1.0 + math.exp(-logit))
@@ -218,7 +218,7 @@ def _chance(logit: float) -> float:
 
 @compiled
 def see_action(k: SparseNetworks | None, room: Room, state: Ints, action: int) -> None:
-    """Writes what the predictor says of the bits asked for, after ``see_state``."""
+    """Writes the predictor's output for the requested bits, after ``see_state``."""
     if k is None:
         return
     sums, hidden, logits, bias, stay, asked = room.sums, room.hidden, room.logits, k.output_bias, k.stay, k.asked
@@ -242,7 +242,7 @@ def see_action(k: SparseNetworks | None, room: Room, state: Ints, action: int) -
 
 @compiled
 def leans_on_open(k: SparseNetworks | None, i: int, base: Ints) -> bool:
-    """Whether what the group of bit i says depends on an outcome bit that is open, -1 in ``base`` int64 [O]."""
+    """Whether the prediction of bit i's group depends on an open outcome bit, which is -1 in ``base`` int64 [O]."""
     found = False
     if k is None:
         return found
@@ -265,18 +265,18 @@ def ask(
     slot: Ints,
     factors: Ints,
 ) -> float:
-    """P(bit i = 1) by its group, in the eyes of a particle that knows the outcome bits before it, after ``see_action``.
+    """P(bit i = 1) by its group, given a particle's earlier outcome bits, after ``see_action``.
 
     Args:
         k: the networks.
         room: work space.
         i: the bit.
-        action: taken.
-        q: the particle that knows the open bits.
-        state: bits, int64 [F].
-        base: of the outcome, -1 where open, int64 [O].
-        slot: the number of each open bit among them, int64 [O].
-        factors: values of the open bits, int64 [n, O].
+        action: the action.
+        q: the particle, which has values of the open bits.
+        state: bits of the state, int64 [F].
+        base: bits of the outcome, -1 if open, int64 [O].
+        slot: index of each open bit among the open bits, int64 [O].
+        factors: values of the open bits of each particle, int64 [n, O].
     """
     if k is None:
         return 0.5

@@ -32,13 +32,13 @@ class TrainingConfig:
     Attributes:
         learning_rate: AdamW's largest, at a third of the one-cycle schedule.
         weight_decay: AdamW's.
-        memory: AdamW's second beta, how long squared gradients are remembered; less makes large rates safe.
+        memory: AdamW's second beta, the decay rate of squared gradients; a smaller one makes large rates safe.
         batch_size: rows of a gradient step.
-        epochs: passes over the distinct rows, within the bounds on steps.
-        min_steps: fewest gradient steps.
-        max_steps: most gradient steps.
+        epochs: passes over the distinct rows, subject to the bounds on steps.
+        min_steps: smallest number of gradient steps.
+        max_steps: largest number of gradient steps.
         validation: share of episodes held out.
-        checks: how often the held-out loss is looked at; the best weights seen are kept.
+        checks: number of evaluations of the held-out loss; the weights with the lowest loss are kept.
         patience: stop after this many checks without a better held-out loss.
         loss: "cross_entropy", or "squared" as in the paper.
         negligible: a factor whose held-out cross-entropy under the predictor is below this many nats gets no group
@@ -69,7 +69,7 @@ class Examples:
         states: int64 [N, F].
         actions: int64 [N].
         outcomes: int64 [N, O], next factors and ``terminated``.
-        weights: float [N], how often each was met, scaled to a mean of one.
+        weights: float [N], counts of each transition, scaled to a mean of one.
     """
 
     states: Tensor
@@ -86,12 +86,12 @@ class Examples:
         return Examples(self.states[rows], self.actions[rows], self.outcomes[rows], self.weights[rows])
 
     def spread(self, most: int) -> Examples:
-        """At most so many rows, evenly spread: distinct rows are sorted, and the first ones look alike."""
+        """At most ``most`` rows, evenly spaced, since distinct rows are sorted and neighbours are similar."""
         return self.select(torch.linspace(0, len(self) - 1, min(len(self), most)).long()) if len(self) else self
 
 
 def examples(rows: TransitionBatch) -> Examples:
-    """Distinct transitions with counts: the paper's P(Y | X) as target, without doing equal rows again and again."""
+    """Distinct transitions with counts: the paper's P(Y | X) as target, without repeated rows."""
     return as_examples(rows.states, rows.actions, rows.next_states, rows.terminated, merge=True)
 
 
@@ -102,13 +102,13 @@ def as_examples(
     terminated: NDArray[np.bool_],
     merge: bool = False,
 ) -> Examples:
-    """Transitions as tensors; ``merge`` joins equal ones where that shortens the table."""
+    """Transitions as tensors; ``merge`` merges equal ones if that shortens the table."""
     outcomes = np.concatenate([next_states, terminated[:, None].astype(np.int64)], axis=1)
     weights = np.ones(len(actions), dtype=np.float32)
     if merge:
         tags = hash_rows(np.concatenate([states, actions[:, None], outcomes], axis=1))
         _, first, counts = np.unique(tags, return_index=True, return_counts=True)
-        order = np.argsort(first)  # the order met, not that of the hashes
+        order = np.argsort(first)  # in the order of observation, not of the hashes
         first, counts = first[order], counts[order]
         if len(first) < 0.8 * len(actions):
             states, actions, outcomes = states[first], actions[first], outcomes[first]
@@ -132,10 +132,10 @@ def losses(codec: FactorCodec, logits: Tensor, outcomes: Tensor, loss: Loss) -> 
 
 
 class Trainer:
-    """Fits a predictor and then a conditioner to examples, or both to one observation after another.
+    """Fits a predictor and then a conditioner to examples, or both to single observations in turn.
 
-    The conditioner's loss never reaches the predictor, so the order does not matter to the predictor; a conditioner
-    that corrects a finished predictor has a fixed thing to correct.
+    The conditioner's loss has no gradient with respect to the predictor, which can therefore be fitted first; the conditioner
+    then corrects a fixed predictor.
 
     Args:
         codec: the factors.
@@ -178,7 +178,7 @@ class Trainer:
         progress: Progress | None,
         shrinking: Shrinking | None = None,
     ) -> float:
-        """Fits the predictor; leaves its best weights in place; returns epochs done. ``shrinking`` prunes it on the way."""
+        """Fits the predictor, with its best weights at the end; returns the epochs. ``shrinking`` prunes it during training."""
         return self._run(self.predictor, self.predictor_losses, train, held_out, generator, progress, shrinking)
 
     def fit_conditioner(
@@ -189,26 +189,26 @@ class Trainer:
         progress: Progress | None,
         shrinking: Shrinking | None = None,
     ) -> float:
-        """Fits the conditioner, if any factor needs it; leaves its best weights in place; returns epochs done."""
+        """Fits the conditioner, if any factor needs it, with its best weights at the end; returns the epochs."""
         if self.conditioner is None or len(self.conditioner.members) == 0:
             return 0.0
         return self._run(self.conditioner, self.conditioner_losses, train, held_out, generator, progress, shrinking)
 
     def observe(self, optimizer: torch.optim.Optimizer, batch: Examples) -> None:
-        """One gradient step of both networks at once."""
+        """One gradient step of both networks."""
         total = self.predictor_losses(batch, self.config.loss).sum(dim=1)
         if self.conditioner is not None:
             total = total + self.conditioner_losses(batch, self.config.loss).sum(dim=1)
         _descend(optimizer, total.mean())
 
     def open_factors(self, rows: Examples) -> Tensor:
-        """Which factors the predictor leaves open, bool [O]; all False where fewer than two are: nothing depends on another."""
+        """Factors of which the predictor is uncertain, bool [O]; all False if there are fewer than two."""
         nats = self._mean(self.predictor_losses, rows)
         still_open = nats > self.config.negligible
         return still_open if int(still_open.sum()) > 1 else torch.zeros_like(still_open)
 
     def evaluate(self, rows: Examples) -> tuple[float, float | None]:
-        """Mean cross-entropy in nats a transition of the predictor and of the conditioner (given the true others)."""
+        """Mean cross-entropy, in nats per transition, of predictor and conditioner (given the true other variables)."""
         first = float(self._mean(self.predictor_losses, rows).sum())
         if self.conditioner is None:
             return first, None
@@ -243,7 +243,7 @@ class Trainer:
         best, best_weights, waited, done = math.inf, _weights(module), 0, 0
         for batch in batches(train, config.batch_size, n_steps, generator):
             _set_rate(optimizer, config.learning_rate * one_cycle(done / n_steps))
-            with noise(module, generator if shrinking is None else None):  # few paths are left: each has to hold
+            with noise(module, generator if shrinking is None else None):  # no dropout when few paths remain
                 total = row_losses(batch, config.loss).sum(dim=1)
             loss = (total * batch.weights).mean()
             _descend(optimizer, loss if shrinking is None else loss + shrinking.penalty())
@@ -289,7 +289,7 @@ def _weights(module: nn.Module) -> dict[str, Tensor]:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Lets torch use one thread for a while: networks this small gain nothing from more, and sums come out the same anywhere."""
+    """Limits torch to one thread: small networks gain nothing from more, and the order of sums is then reproducible."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -300,7 +300,7 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def noise(module: nn.Module, generator: torch.Generator | None) -> Iterator[None]:
-    """Switches the module's dropout on for a while, if there is a generator."""
+    """Activates the module's dropout within the block, if there is a generator."""
     layers = [layer for layer in module.modules() if isinstance(layer, Dropout)]
     for layer in layers:
         layer.generator = generator
@@ -323,7 +323,7 @@ def batches(rows: Examples, size: int, n_steps: int, generator: torch.Generator)
 
 
 def one_cycle(t: float, peak: float = 0.3, start: float = 0.04) -> float:
-    """Share of the largest learning rate at share ``t`` of training: a cosine up to ``peak``, then down to nothing.
+    """Share of the largest learning rate at share ``t`` of training: a cosine from ``start`` to 1 at ``peak``, then to 1e-4.
 
     Smith and Topin 2017, "Super-convergence".
     """

@@ -1,9 +1,9 @@
 """Truth tables of pruned networks of bits.
 
-Each outcome bit has a table over the few bits that it still depends on, of the state and of earlier outcome bits; a draw is one
-look-up. The parents of a bit are the inputs connected to it by some path whose effect exceeds a tolerance; constant inputs and
-negligible paths are fixed to the input's mode, and the resulting error is measured on transitions. A bit with too many parents
-for a table is drawn by the remaining connections of its networks (``sparse.py``).
+Each outcome bit has a table over the few bits on which it still depends, of the state and of earlier outcome bits; a sample is
+one look-up. The parents of a bit are the inputs connected to it by some path whose effect exceeds a tolerance; all other inputs
+are fixed to their modes, and the resulting error is measured on transitions. A bit with too many parents for a table is
+sampled with the remaining connections of its networks (``sparse.py``).
 Shapes: F bits of a state, O = F + 1 of an outcome (``terminated`` last), A actions.
 """
 
@@ -28,22 +28,22 @@ from mbagent_envs.jit import borrowed, compiled, inlined
 from mbagent_envs.random_keys import uniform_at
 
 MOST_PARENTS = 12
-"""A table has at most two to this power of entries for each action."""
+"""Largest number of parents of a table, which then has two to this power entries for each action."""
 
 CONSTANT_TOLERANCE = 0.002
-"""What taking bits for their usual values may change in all, in total variation summed over variables."""
+"""Largest allowed error of fixing bits to their modes, in total variation summed over variables."""
 
 PARENT = 2
-"""Marks a bit that matters; 0 and 1 are values that a bit is taken for."""
+"""Marks a parent; 0 and 1 are values to which other bits are fixed."""
 
 TABLE_ROWS = 8192
-"""Transitions that differences are measured on, at most."""
+"""Largest number of transitions on which differences are measured."""
 
 Marks = NDArray[np.int8]
 
 
 class Pair(NamedTuple):
-    """The two networks and from which probability on the predictor is trusted."""
+    """The two networks, and the probability ``certain`` from which on the predictor is trusted."""
 
     predictor: DensePredictor
     conditioner: Conditioner | None
@@ -64,7 +64,7 @@ def _predicted(pair: Pair, inputs: Tensor, outputs: slice) -> Tensor:
 
 
 def chances(pair: Pair, columns: Tensor, i: int) -> Tensor:
-    """P(bit i = 1) [N] from columns of state, action and outcome [N, n_inputs + O], as ``samplers.sample_causal`` has it."""
+    """P(bit i = 1) [N] from columns of state, action and outcome [N, n_inputs + O], as in ``sampling.sample_causal``."""
     n_inputs, conditioner = pair.predictor.codec.n_inputs, pair.conditioner
     logit = _predicted(pair, columns[:, :n_inputs], slice(i, i + 1))[:, 0]
     chance = torch.sigmoid(logit.double())
@@ -75,12 +75,12 @@ def chances(pair: Pair, columns: Tensor, i: int) -> Tensor:
     weight = groups.weight[rows] if groups.mask is None else groups.weight[rows] * groups.mask[rows]
     hidden = ACTIVATIONS[conditioner.activation](columns @ weight.T + groups.bias[rows])
     own = (hidden @ conditioner.readout[g] + conditioner.offset[g])[:, 0]
-    asked = torch.sigmoid((own + logit if conditioner.correction else own).double())
-    return torch.where(torch.maximum(chance, 1.0 - chance) >= pair.certain, chance, asked)
+    conditioned = torch.sigmoid((own + logit if conditioner.correction else own).double())
+    return torch.where(torch.maximum(chance, 1.0 - chance) >= pair.certain, chance, conditioned)
 
 
 def _paths(layers: list[Tensor]) -> NDArray[np.bool_]:
-    """Which inputs [outputs, inputs] a path leads from, through weights [to, from]."""
+    """Mask [outputs, inputs] of the inputs with a path to each output, through layers of weights [to, from]."""
     reach = (layers[0] != 0.0).double()
     for weight in layers[1:]:
         reach = ((weight != 0.0).double() @ reach > 0.0).double()
@@ -89,7 +89,7 @@ def _paths(layers: list[Tensor]) -> NDArray[np.bool_]:
 
 
 def paths(pair: Pair) -> NDArray[np.bool_]:
-    """Which columns of state, action and outcome a path leads from to each outcome bit, bool [O, n_inputs + O]."""
+    """Mask of the columns of state, action and outcome with a path to each outcome bit, bool [O, n_inputs + O]."""
     predictor, conditioner, codec = pair.predictor, pair.conditioner, pair.predictor.codec
     n_outputs, n_inputs = len(codec.outputs), codec.n_inputs
     reach = np.zeros((n_outputs, n_inputs + n_outputs), dtype=np.bool_)
@@ -111,7 +111,7 @@ def paths(pair: Pair) -> NDArray[np.bool_]:
 
 @torch.no_grad()
 def find_parents(pair: Pair, rows: Examples) -> Marks:
-    """What each outcome bit hangs on: int8 [O, F + O], PARENT or the value that a bit is taken for; of state and outcome."""
+    """Parents of each outcome bit among the bits of state and outcome: int8 [O, F + O], PARENT or the bit's fixed value."""
     codec, rows = pair.predictor.codec, rows.spread(TABLE_ROWS)
     columns = torch.cat((codec.inputs(rows.states, rows.actions), codec.targets(rows.outcomes)), dim=1)
     usual, reach, n_bits = (columns.mean(dim=0) > 0.5).float(), paths(pair), codec.n_state_columns
@@ -125,12 +125,12 @@ def find_parents(pair: Pair, rows: Examples) -> Marks:
 
 
 class Sample(NamedTuple):
-    """Transitions that differences are measured on.
+    """Transitions on which differences are measured.
 
     Attributes:
-        columns: of state, action and outcome, [N, n_inputs + O].
-        usual: the value that each of them has most often.
-        weights: of the transitions, double [N], sum 1.
+        columns: columns of state, action and outcome, [N, n_inputs + O].
+        usual: mode of each column, [n_inputs + O].
+        weights: weights of the transitions, double [N], sum 1.
     """
 
     columns: Tensor
@@ -138,11 +138,11 @@ class Sample(NamedTuple):
     weights: Tensor
 
     def needed(self, pair: Pair, i: int, columns: NDArray[np.int64], tolerance: float) -> NDArray[np.int64]:
-        """Places of the columns that outcome bit i hangs on: to take all others for their usual values changes less than this."""
+        """Indices of the parents of outcome bit i: fixing all other columns to their modes changes at most ``tolerance``."""
         known = chances(pair, self.columns, i)
         alone = np.array([self._changed(pair, i, known, columns[place : place + 1]) for place in range(len(columns))])
         order, few, many = np.argsort(alone, kind="stable"), 0, int((alone <= tolerance).sum())
-        while few < many:  # how many go together, at most
+        while few < many:  # bisection for the largest number of columns that can be fixed
             middle = (few + many + 1) // 2
             if self._changed(pair, i, known, columns[order[:middle]]) <= tolerance:
                 few = middle
@@ -151,7 +151,7 @@ class Sample(NamedTuple):
         return order[few:]
 
     def _changed(self, pair: Pair, i: int, known: Tensor, columns: NDArray[np.int64]) -> float:
-        """How far the chance of bit i moves if these columns are taken for their usual values, mean over transitions."""
+        """Mean absolute change of the probability of bit i if these columns are fixed to their modes."""
         differs = torch.nonzero((self.columns[:, columns] != self.usual[columns]).any(dim=1))[:, 0]
         if not len(differs):
             return 0.0
@@ -161,21 +161,21 @@ class Sample(NamedTuple):
 
 
 def tabulable(marks: Marks) -> NDArray[np.bool_]:
-    """Which outcome bits have few enough parents for a table, bool [O]."""
+    """Mask of the outcome bits with few enough parents for a table, bool [O]."""
     few: NDArray[np.bool_] = (marks == PARENT).sum(axis=1) <= MOST_PARENTS
     return few
 
 
 @torch.no_grad()
 def tabulate(pair: Pair, marks: Marks, which: NDArray[np.bool_]) -> list[Table | None]:
-    """Tables over what ``marks`` names, of the bits ``which``; None for all others."""
+    """Tables of the outcome bits ``which`` over their parents in ``marks``; None for all other bits."""
     codec, reach = pair.predictor.codec, paths(pair)
     acts = [bool(row[codec.n_state_columns : codec.n_inputs].any()) for row in reach]
     return [_table(pair, marks[i], acts[i], i) if which[i] else None for i in range(len(marks))]
 
 
 def _table(pair: Pair, marks: Marks, acts: bool, i: int) -> Table:
-    """P(bit i = 1) for each value of its parents, and for each action where it ``acts``."""
+    """P(bit i = 1) for each combination of its parents' values, and for each action if ``acts``."""
     codec, mine = pair.predictor.codec, np.flatnonzero(marks == PARENT)
     n_bits, n_actions, size = codec.n_state_columns, codec.n_actions, 1 << len(mine)
     fixed = torch.from_numpy(np.where(marks == PARENT, 0, marks).astype(np.float32))
@@ -190,15 +190,15 @@ def _table(pair: Pair, marks: Marks, acts: bool, i: int) -> Table:
 
 
 IMPROBABLE_TOLERANCE = 0.002
-"""What taking improbable values for impossible may change in all, in total variation summed over variables."""
+"""Largest allowed error of treating improbable values as impossible, in total variation summed over variables."""
 
 
 class Table(NamedTuple):
-    """What one outcome bit hangs on.
+    """The truth table of one outcome bit.
 
     Attributes:
-        states: bits of the state, in order.
-        others: bits of the outcome, in order.
+        states: parents among the bits of the state, in order.
+        others: parents among the bits of the outcome, in order.
         chances: P(bit = 1): [1 or A, 2, ..., 2], an axis for the action, and one for each of these bits, the last one first.
     """
 
@@ -207,7 +207,7 @@ class Table(NamedTuple):
     chances: Floats
 
     def simplified(self, chances: Floats) -> Table:
-        """With other chances, and without what makes no difference to them."""
+        """The table with other probabilities, without parents that make no difference."""
         if len(chances) > 1 and (chances == chances[:1]).all():
             chances = chances[:1]
         bits, n_states = [*self.states, *self.others], len(self.states)
@@ -224,14 +224,14 @@ class BitRules(NamedTuple):
     """Tables and networks.
 
     Attributes:
-        table: chances of all tables, one after another.
-        bits: a row for each outcome bit that is more than a copy, in order, int64 [R, 6]: the bit; where its table begins, -1 if
-            the networks are asked; how much further that of the next action is; where its parents begin, of the state, of the
-            outcome, and where they end.
-        parents: of all tables, int64.
-        copies: a row for each other bit, int64 [O - R, 4]: the bit; a bit of the state; what follows from its being 0; and 1.
+        table: probabilities of all tables, concatenated.
+        bits: a row for each outcome bit that is not a copy, in order, int64 [R, 6]: the bit; the start of its table, -1 if the
+            networks are used; the offset of the next action's table; the start of its parents in the state, their start in the
+            outcome, and their end.
+        parents: parents of all tables, int64.
+        copies: a row for each other bit, int64 [O - R, 4]: the bit; a bit of the state; its value if that bit is 0; if it is 1.
         n_actions: A.
-        networks: of the bits without a table; None where all have one.
+        networks: networks of the bits without a table; None if all have one.
     """
 
     table: Floats
@@ -245,13 +245,13 @@ class BitRules(NamedTuple):
 def compile_rules(
     tables: Sequence[Table | None], networks: SparseNetworks | None, n_actions: int, settled: bool = False
 ) -> BitRules:
-    """The rules from a table, or None, for each outcome bit.
+    """Combines the tables, one or None for each outcome bit, to rules.
 
     Args:
-        tables: chances that are next to 0 or 1 are taken for that.
-        networks: tell the bits that have no table.
+        tables: the tables; probabilities close to 0 or 1 are rounded.
+        networks: networks of the bits without a table.
         n_actions: A.
-        settled: whether to leave out values as search does, see ``settled_chance``.
+        settled: whether to omit negligible values as search does, see ``bit_kernels.settled_chance``.
     """
     least, chances, bits, copies, size = IMPROBABLE_TOLERANCE / len(tables), [np.zeros(0)], [], [], 0
     parents: list[int] = []
@@ -276,14 +276,14 @@ def compile_rules(
 
 @inlined
 def _copy(state: Ints, copies: Ints, values: Ints) -> None:
-    """Writes the bits that need no look-up."""
+    """Writes the bits that are copies."""
     for v in range(len(copies)):
         values[copies[v, 0]] = copies[v, 3] if state[copies[v, 1]] == 1 else copies[v, 2]
 
 
 @inlined
 def _by_state(r: int, action: int, state: Ints, bits: Ints, parents: Ints) -> tuple[int, int]:
-    """(place in its table that action and state lead to, weight of the next parent)."""
+    """Index in the table of row r, as far as it is determined by action and state; and the stride of the next parent."""
     place, weight = bits[r, 1] + bits[r, 2] * action, 1
     for v in range(bits[r, 3], bits[r, 4]):
         place += weight * state[parents[v]]
@@ -293,7 +293,7 @@ def _by_state(r: int, action: int, state: Ints, bits: Ints, parents: Ints) -> tu
 
 @compiled
 def sample_rules(states: Ints, actions: Ints, keys: Keys, rules: BitRules) -> tuple[Ints, NDArray[np.bool_]]:
-    """Draws next states int64 [B, F] and ``terminated`` bool [B]: bit i of row b at number i of key b, as ``samplers``."""
+    """Samples next states int64 [B, F] and ``terminated`` bool [B]: bit i of row b uses number i of key b, as in ``sampling``."""
     n_bits, k = states.shape[1], borrowed(rules)
     table, bits, parents, copies, networks, room = k.table, k.bits, k.parents, k.copies, k.networks, room_for(k.networks)
     drawn, ended, none = np.empty_like(states), np.zeros(len(states), dtype=np.bool_), np.zeros((1, 1), dtype=np.int64)
@@ -327,11 +327,11 @@ class RulesWork(NamedTuple):
     """Work space.
 
     Attributes:
-        base: the outcome's settled bits, int64 [O]; -1 where open.
+        base: the outcome's settled bits, int64 [O]; -1 if open.
         open: the open bits, int64 [O].
-        slot: the number of each open bit among them, int64 [O].
+        slot: index of each open bit among the open bits, int64 [O].
         p: particles.
-        room: the networks'.
+        room: work space of the networks.
     """
 
     base: Ints
@@ -344,7 +344,7 @@ class RulesWork(NamedTuple):
 @implements(work_for, BitRules)
 @compiled
 def rules_work(k: BitRules, n_grid: int) -> RulesWork:
-    """See compiled_model."""
+    """See ``models.overloads``."""
     n_outputs = len(k.bits) + len(k.copies)
     return RulesWork(
         np.empty(n_outputs, dtype=np.int64),
@@ -357,7 +357,7 @@ def rules_work(k: BitRules, n_grid: int) -> RulesWork:
 
 @inlined
 def _by_outcome(q: int, place: int, weight: int, v: int, end: int, parents: Ints, base: Ints, slot: Ints, factors: Ints) -> int:
-    """Where the outcome's bits lead to from there, in the eyes of particle q; the parents are number v to ``end``."""
+    """Adds the parents ``v`` to ``end``, with the values of particle q, to the index ``place``, starting at stride ``weight``."""
     while v < end:
         value = base[parents[v]]
         if value < 0:
@@ -371,7 +371,7 @@ def _by_outcome(q: int, place: int, weight: int, v: int, end: int, parents: Ints
 @implements(outcomes, BitRules)
 @compiled
 def rules_outcomes(k: BitRules, work: RulesWork, state: Ints, n_grid: int, key: np.uint64, offset: float, out: Outcomes) -> int:
-    """See compiled_model."""
+    """See ``models.overloads``."""
     table, bits, parents, networks, room, base, slot = k.table, k.bits, k.parents, k.networks, work.room, work.base, work.slot
     grid, total, still_open, p, chances, conditioned = (n_grid, key, offset), 0, work.open, work.p, room.chances, room.conditioned
     factors, values = p.factors, np.empty(2, dtype=np.float64)
@@ -381,7 +381,7 @@ def rules_outcomes(k: BitRules, work: RulesWork, state: Ints, n_grid: int, key: 
     for action in range(k.n_actions):
         see_action(networks, room, state, action)
         n_open = 0
-        begin(p, n_grid, False, place_of(state))  # which bits are open is not known before
+        begin(p, n_grid, False, place_of(state))  # the open bits are not known in advance
         for r in range(len(bits)):
             i, start, end, chance = bits[r, 0], bits[r, 4], bits[r, 5], 0.5
             place, weight = _by_state(r, action, state, bits, parents)

@@ -1,4 +1,4 @@
-"""Networks of bits in compiled search: the same imagined world as by the model's own successors."""
+"""Networks of bits in compiled search: the same outcomes as by the model's own successors."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ N_BITS, N_ACTIONS = 11, 3
 
 
 def world(n: int, seed: int) -> tuple[np.ndarray, ...]:
-    """A wheel of four bits of which one is on, drawn anew; two bits that agree; a bit per action; the rest stays; it may end."""
+    """One of four bits is on, at random; two bits are equal; one bit per action; other bits are constant; random termination."""
     rng = np.random.default_rng(seed)
     states, actions = rng.integers(2, size=(n, N_BITS)), rng.integers(N_ACTIONS, size=n)
     after = states.copy()
@@ -71,10 +71,10 @@ def test_compiled_expansion_is_that_of_the_successors(changes: dict[str, object]
         several += int(compiled.counts[: len(states)].max() > 1)
         for node in range(len(states)):
             assert_same(compiled, plain, node, node)
-    assert several == 3  # with one draw, too: what is rare comes beside it
+    assert several == 3  # even with one sample, since rare values get strata
 
 
-def test_what_follows_a_state_does_not_depend_on_the_others() -> None:
+def test_successors_of_a_state_do_not_depend_on_other_states() -> None:
     model, states = trained()
     together, alone = StateGraph(model), StateGraph(model)
     together.expand(together.add(states, np.zeros(len(states), dtype=np.int64)), 8, seed=3)
@@ -124,7 +124,7 @@ def test_new_weights_make_a_new_kernel() -> None:
     ],
     ids=["not bits", "two layers", "sweeps", "no conditioner", "strings of actions"],
 )
-def test_what_is_not_covered_has_no_kernel(cardinalities: tuple[int, ...], config: NeuralConfig, n_steps: int) -> None:
+def test_unsupported_networks_have_no_kernel(cardinalities: tuple[int, ...], config: NeuralConfig, n_steps: int) -> None:
     model = NeuralTransitionModel(cardinalities, 2, config, n_steps=n_steps)
     assert model.kernel() is None
     assert StateGraph(model).kernel is None

@@ -1,4 +1,4 @@
-"""Pruning networks: what is gone stays gone, what is left still knows the world, and nothing breaks where it fails."""
+"""Pruning networks: removed weights stay removed, predictions remain accurate, and failures change nothing."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ QUICK = TrainingConfig(min_steps=300, max_steps=300, batch_size=64)
 
 
 def shifted(n: int = 1200, seed: int = 0) -> TransitionDataset:
-    """Every bit takes the value of its right neighbour; the last two are drawn anew, equal to each other."""
+    """Every bit takes the value of its right neighbour; the last two are random and equal to each other."""
     rng = np.random.default_rng(seed)
     states, actions = rng.integers(2, size=(n, N_BITS)), rng.integers(N_ACTIONS, size=n)
     after = np.roll(states, -1, axis=1)
@@ -34,12 +34,12 @@ def fitted(data: TransitionDataset, **changes: object) -> NeuralTransitionModel:
     return model
 
 
-def test_what_is_left_still_knows_the_world_and_survives_saving() -> None:
+def test_a_pruned_model_is_accurate_and_can_be_saved() -> None:
     data = shifted()
     model = fitted(data)
     report = model.prune(data, 0.9, config=PruningConfig(evidence=False))
     assert report.log["pruned"] == pytest.approx(0.9, abs=0.002)
-    assert report.conditioner_loss == pytest.approx(np.log(2.0), abs=0.05)  # one coin is all that is not known
+    assert report.conditioner_loss == pytest.approx(np.log(2.0), abs=0.05)  # one coin is the only uncertainty
     for connections in model.connections().values():
         assert connections.left / connections.total == pytest.approx(0.1, abs=0.005)
     again = NeuralTransitionModel(data.cardinalities, data.n_actions, model.config)
@@ -47,7 +47,7 @@ def test_what_is_left_still_knows_the_world_and_survives_saving() -> None:
     assert {k: c.left for k, c in again.connections().items()} == {k: c.left for k, c in model.connections().items()}
 
 
-def test_pruned_again_nothing_comes_back_and_a_new_fit_has_everything() -> None:
+def test_removed_connections_stay_removed_until_the_next_fit() -> None:
     data = shifted(400)
     model = fitted(data)
     by_size = PruningConfig(evidence=False)
@@ -62,7 +62,7 @@ def test_pruned_again_nothing_comes_back_and_a_new_fit_has_everything() -> None:
     assert model.fit(data).log["pruned"] == 0.0
 
 
-def test_a_model_that_cannot_be_pruned_is_as_it_was() -> None:
+def test_a_model_that_cannot_be_pruned_is_unchanged() -> None:
     data = shifted(400)
     model = fitted(data)
     before = model.state_dict()
@@ -92,7 +92,7 @@ def test_weights_shared_over_positions_are_pruned_too() -> None:
 
 
 @pytest.mark.parametrize("gradual", [True, False])
-def test_the_smallest_go(gradual: bool) -> None:
+def test_the_smallest_weights_are_removed(gradual: bool) -> None:
     layer = torch.nn.Linear(4, 2)
     weights = torch.tensor([[4.0, -0.1, 3.0, 0.2], [-5.0, 0.3, 0.05, 6.0]])
     layer.weight.data = weights.clone()
@@ -104,7 +104,7 @@ def test_the_smallest_go(gradual: bool) -> None:
     assert torch.equal(layer.weight.data, torch.where(weights.abs() > 1.0, weights, torch.zeros(())))
 
 
-def test_a_world_in_which_nothing_is_open_is_pruned_too() -> None:
+def test_models_without_uncertain_factors_are_pruned_too() -> None:
     nothing, actions = np.zeros((300, 4), dtype=np.int64), np.arange(300) % 2
     model = fitted(data := dataset((2,) * 4, 2, nothing, actions, nothing))
     assert model.conditioner is not None
@@ -115,7 +115,7 @@ def test_a_world_in_which_nothing_is_open_is_pruned_too() -> None:
     assert not ended.any()
 
 
-def test_what_many_connections_are_left_of_goes_by_whole_matrices() -> None:
+def test_dense_matrices_are_used_if_many_connections_remain() -> None:
     data = shifted(400)
     model = fitted(data)
     model.prune(data, 0.1, config=PruningConfig(evidence=False))

@@ -1,4 +1,4 @@
-"""Forecasts several steps ahead: the data they are learned from, and both ways of making them."""
+"""Forecasts several steps ahead, iterated and direct, and their training data."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ from tests.models.helpers import QUICK, dataset, played
 from tests.worlds import TableWorld
 
 WORLD = TableWorld(np.eye(5)[(np.arange(5)[:, None] + np.array([1, 2])) % 5])
-"""A ring of five states: action 0 goes on one state, action 1 two."""
+"""A ring of five states: action 0 moves by one state, action 1 by two."""
 
 
 def ring_data(n: int = 600, episode_length: int = 20) -> TransitionDataset:
@@ -68,7 +68,7 @@ def test_strings_too_long_to_be_numbered_are_refused() -> None:
         ring_model((1,))
 
 
-def test_states_some_steps_apart_are_those_of_one_episode() -> None:
+def test_states_several_steps_apart_are_from_one_episode() -> None:
     # Two episodes, their rows interleaved as two environments give them: 0 1 2 3 (cut off) and 5 6 7 (terminated at 7).
     rows = [(0, 0, 1, 0, 0), (5, 1, 6, 0, 1), (1, 1, 2, 0, 0), (6, 1, 7, 1, 1), (2, 0, 3, 0, 0)]
     states, actions, following, ends, episodes = np.array(rows).T
@@ -83,15 +83,15 @@ def test_states_some_steps_apart_are_those_of_one_episode() -> None:
     assert found[0] == (0 + 2 * 1, 2, False)
     assert found[1] == (1 + 2 * 0, 3, False)
     assert found[5] == (1 + 2 * 1, 7, True)
-    assert found[6][0] % 2 == 1  # its first action; the one after the end is any
+    assert found[6][0] % 2 == 1  # its first action; the one after termination is random
     assert found[6][1:] == (7, True)
-    assert 2 not in found  # cut off: nobody knows what would have come
+    assert 2 not in found  # truncated: the outcome is unknown
     np.testing.assert_array_equal(steps_apart(data, 1).rows().next_states, data.rows().next_states[[0, 2, 4, 1, 3]])
     with pytest.raises(ValueError, match="n = 0"):
         steps_apart(data, 0)
 
 
-def test_ends_near_a_limit_on_episodes_look_no_likelier_than_they_are() -> None:
+def test_termination_near_the_limit_of_episodes_is_not_overestimated() -> None:
     # An episode ends with probability 0.1 at each step and is cut off after 10; strings of 5 end with 1 - 0.9^5 = 0.41.
     lengths = np.random.default_rng(0).geometric(0.1, size=4000)
     ended, lengths = lengths <= 10, np.minimum(lengths, 10)
@@ -108,7 +108,7 @@ def test_ends_near_a_limit_on_episodes_look_no_likelier_than_they_are() -> None:
     assert len(steps_apart(data, 11)) == 0
 
 
-def test_iterating_goes_where_the_steps_go_and_stays_where_an_episode_ended() -> None:
+def test_iterated_forecasts_equal_single_steps_and_stay_in_terminal_states() -> None:
     strings = random_strings(derive(1, np.arange(40)), 6, 2)
     starts = np.arange(40)[:, None] % 5
     reached, over = iterate(WORLD, starts, strings, derive(2, np.arange(40)))
@@ -130,7 +130,7 @@ def test_models_of_several_steps_learn_a_ring_exactly() -> None:
     assert {"seconds_1_steps", "seconds_2_steps", "seconds_4_steps"} <= set(report.log)
     assert progress == sorted(progress)
     starts = np.arange(60)[:, None] % 5
-    for n in (0, 1, 2, 3, 4, 6):  # with a model of its own, one step on from one, several steps on
+    for n in (0, 1, 2, 3, 4, 6):  # with a separate model, one step after one, several steps after one
         strings = random_strings(derive(4, np.arange(60), n), n, 2)
         reached, _ = model.forecast(starts, strings, derive(5, np.arange(60)))
         hit = reached[:, 0] == (starts[:, 0] + n + strings.sum(axis=1)) % 5
@@ -142,7 +142,7 @@ def test_episodes_too_short_for_a_model_leave_it_out() -> None:
     model.fit(ring_data(), seed=1)
     strings = random_strings(derive(4, np.arange(30)), 30, 2)
     reached, _ = model.forecast(np.zeros((30, 1), dtype=np.int64), strings, derive(5, np.arange(30)))
-    assert (reached[:, 0] == (30 + strings.sum(axis=1)) % 5).mean() > 0.8  # two steps, and 28 more one by one
+    assert (reached[:, 0] == (30 + strings.sum(axis=1)) % 5).mean() > 0.8  # two steps, and 28 single ones
 
 
 def test_weights_are_kept_and_foreign_ones_refused() -> None:
@@ -177,7 +177,7 @@ def test_compiled_networks_of_strings_are_the_trained_ones() -> None:
         logits = model.predictor(torch.from_numpy(rows.states), torch.from_numpy(rows.actions))
         expected = torch.softmax(logits, dim=2).numpy()
     np.testing.assert_allclose(model.probabilities(rows.states, rows.actions), expected, atol=1e-5)
-    # All joint outcomes together have probability one: the conditioner reads the string, too.
+    # The probabilities of all joint outcomes sum to one: the conditioner also depends on the string.
     outcomes = (np.arange(2**9)[:, None] >> np.arange(9)) & 1
     many = np.repeat(rows.states[:1], 2 * len(outcomes), axis=0)
     ends = np.repeat([False, True], len(outcomes))
@@ -185,7 +185,7 @@ def test_compiled_networks_of_strings_are_the_trained_ones() -> None:
     assert np.exp(logs).sum() == pytest.approx(1.0, abs=1e-6)
 
 
-def test_on_planes_every_action_of_a_string_is_felt_where_it_leads() -> None:
+def test_on_planes_every_action_of_a_string_has_an_effect() -> None:
     game = Maneuverer(size=4)
     space = FactoredSpace(game.observation_space)
     model = build_string(space, 4, 0.02, n_steps=3)

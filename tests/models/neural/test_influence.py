@@ -1,4 +1,4 @@
-"""What the connections that are left say: which variables belong together."""
+"""Groups of dependent variables from the remaining connections."""
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from tests.models.helpers import dataset
 
 
 def sparse() -> NeuralTransitionModel:
-    """Four bits: 0 hangs on 1 and the second action, 2 on 3; 3 is drawn after 1."""
+    """Four bits: 0 depends on 1 and the second action, 2 on 3; 3 depends on the next value of 1."""
     model = NeuralTransitionModel((2,) * 4, 2, NeuralConfig(hidden=(2,), group_size=1))
     weights = {name: np.zeros_like(array) for name, array in model.state_dict().items()}
     weights["conditioner.grouped"] = np.ones(5, dtype=np.bool_)
@@ -36,14 +36,14 @@ def test_sums_over_paths() -> None:
     assert (found.others > 0.0).sum() == 1
 
 
-def test_modules_and_groups_are_told_by_name() -> None:
+def test_modules_and_groups_have_names() -> None:
     found, names = influence(sparse()), ("a", "b", "c", "d")
     assert {module.text(names) for module in modules(found)} == {"a, b <- b, action", "c, d <- d"}
     assert [group.text(names) for group in dependent_groups(found)] == ["b, d <- nothing"]
 
 
-def test_paths_that_cancel_each_other_link_nothing() -> None:
-    """Two nodes hold the sum and the difference of two bits: each bit's successor reads both, but hangs on one bit alone."""
+def test_paths_that_cancel_each_other_are_no_dependency() -> None:
+    """Two nodes contain the sum and the difference of two bits: each next bit reads both, but depends on one bit only."""
     rng = np.random.default_rng(0)
     states = rng.integers(2, size=(400, 2))
     data = dataset((2, 2), 2, states, rng.integers(2, size=400), states)

@@ -17,7 +17,7 @@ Ints = np.ndarray
 
 
 class TorchBody(torch.nn.Module):
-    """A body that there is no compiled kernel for."""
+    """A body without a compiled kernel."""
 
     def __init__(self, codec: FactorCodec, generator: torch.Generator) -> None:
         super().__init__()
@@ -63,7 +63,7 @@ def test_with_a_conditioner_only_reachable_states_are_sampled(pairs: list[tuple[
     assert counts[valid] == pytest.approx([0.5, 0.5], abs=0.06)
 
 
-def test_the_predictor_alone_cannot_tell_reachable_states_from_others() -> None:
+def test_the_predictor_alone_also_samples_unreachable_states() -> None:
     n, model = 4000, NeuralTransitionModel((2, 2), 1, NeuralConfig(conditioner=None, training=QUICK))
     model.fit(paper_world([(1, 0), (0, 1)]))
     where = (np.zeros((n, 2), dtype=np.int64), np.zeros(n, dtype=np.int64))
@@ -84,7 +84,7 @@ def test_probabilities_of_all_outcomes_sum_to_one_and_are_what_is_sampled(config
 
 @pytest.mark.parametrize("config", [NeuralConfig(), NeuralConfig(conditioner=None), NeuralConfig(conditioner="others")])
 @pytest.mark.parametrize("body", [None, TorchBody])
-def test_a_row_is_the_same_alone_and_in_any_batch_to_the_last_bit(
+def test_a_row_is_bitwise_the_same_alone_and_in_any_batch(
     config: NeuralConfig, body: Callable[..., torch.nn.Module] | None
 ) -> None:
     cardinalities, n = (*MIXED, 5, 2, 2, 2), 150
@@ -184,7 +184,7 @@ def test_a_fit_depends_on_its_seed_alone_and_leaves_the_process_wide_generators_
     torch.random.manual_seed(0)
     first = weights(5, 0)
     torch.random.manual_seed(1)
-    np.random.seed(1)  # noqa: NPY002 (that it does not matter is the question)
+    np.random.seed(1)  # noqa: NPY002 (the test is that it has no effect)
     torch_state, numpy_state = torch.random.get_rng_state(), str(np.random.get_state())  # noqa: NPY002
     n_threads = torch.get_num_threads()
     torch.set_num_threads(2)
@@ -211,7 +211,7 @@ def test_on_line_learning_follows_a_world_that_changes() -> None:
 
 @pytest.mark.parametrize("real_guess", [False, True])
 def test_sweeps_reach_the_joint_distribution(real_guess: bool) -> None:
-    """Three bits with probabilities that one-bit moves can travel between."""
+    """Three bits whose possible outcomes are connected by changes of single bits."""
     cardinalities, n = (2, 2, 2), 8000
     joint = np.array([0.3, 0.1, 0.05, 0.05, 0.05, 0.05, 0.1, 0.3])
     drawn = np.random.default_rng(0).choice(8, size=n, p=joint)
@@ -238,11 +238,11 @@ def test_the_papers_configuration_learns_its_own_example() -> None:
 
 
 def test_progress_rises_to_one_and_an_empty_data_set_is_no_accident() -> None:
-    told: list[float] = []
+    shares: list[float] = []
     model = NeuralTransitionModel(MIXED, 2, NeuralConfig(training=TrainingConfig(min_steps=40, max_steps=40, patience=99)))
-    model.fit(mixed_world(200)[0], progress=told.append)
-    assert told[-1] == 1.0
-    assert all(a <= b for a, b in pairwise(told))
+    model.fit(mixed_world(200)[0], progress=shares.append)
+    assert shares[-1] == 1.0
+    assert all(a <= b for a, b in pairwise(shares))
     report = model.fit(TransitionDataset(MIXED, 2))
     assert report.n_train == 0
     assert np.isfinite(model.marginals(*random_rows(MIXED, 2, 5))).all()

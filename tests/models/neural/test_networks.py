@@ -20,7 +20,7 @@ def rows(codec: FactorCodec, n: int = 6) -> tuple[torch.Tensor, torch.Tensor, to
 
 
 @pytest.mark.parametrize("cardinalities", CARDINALITIES)
-def test_columns_and_logits_tell_values_apart(cardinalities: tuple[int, ...]) -> None:
+def test_columns_and_logits_distinguish_values(cardinalities: tuple[int, ...]) -> None:
     codec = FactorCodec(cardinalities, 2)
     _, _, following = rows(codec, 40)
     columns = codec.targets(following)
@@ -33,7 +33,7 @@ def test_columns_and_logits_tell_values_apart(cardinalities: tuple[int, ...]) ->
 
 @pytest.mark.parametrize("mask", ["causal", "others"])
 @pytest.mark.parametrize("cardinalities", CARDINALITIES)
-def test_gradients_prove_that_output_i_sees_what_its_mask_says(mask: Mask, cardinalities: tuple[int, ...]) -> None:
+def test_gradients_of_output_i_follow_its_mask(mask: Mask, cardinalities: tuple[int, ...]) -> None:
     codec = FactorCodec(cardinalities, 2)
     conditioner = Conditioner(codec, mask, 3, correction=False, generator=generator())
     states, actions, following = rows(codec)
@@ -41,7 +41,7 @@ def test_gradients_prove_that_output_i_sees_what_its_mask_says(mask: Mask, cardi
     for i, cardinality in enumerate(codec.outputs):
         if cardinality == 1:
             continue
-        # The last value of factor i: softmax is blind to a constant, single logits are not.
+        # The last value of factor i: a softmax is invariant to a constant, single logits are not.
         output = conditioner.from_columns(inputs, targets)[:, i, cardinality - 1].sum()
         gradient = torch.autograd.grad(output, targets)[0].abs().sum(dim=0)
         for j in range(len(codec.outputs)):
@@ -66,7 +66,7 @@ def test_pruned_weights_stay_zero_in_training(mask: Mask) -> None:
     assert (conditioner.groups.weight[pruned] != 0).all()
 
 
-def test_a_correction_starts_at_nothing_and_factors_without_a_group_stay_there() -> None:
+def test_a_correction_starts_at_zero_and_stays_zero_without_a_group() -> None:
     codec = FactorCodec(MIXED, 2)
     fresh = Conditioner(codec, generator=generator())
     assert (fresh(*rows(codec))[:, codec.floor == 0] == 0).all()
@@ -78,7 +78,7 @@ def test_a_correction_starts_at_nothing_and_factors_without_a_group_stay_there()
 
 
 @pytest.mark.parametrize("cardinalities", CARDINALITIES)
-def test_an_untrained_predictor_expects_things_to_stay(cardinalities: tuple[int, ...]) -> None:
+def test_an_untrained_predictor_predicts_no_change(cardinalities: tuple[int, ...]) -> None:
     codec = FactorCodec(cardinalities, 3)
     states, actions, _ = rows(codec, 30)
     logits = DensePredictor(codec, generator=generator())(states, actions)
@@ -92,7 +92,7 @@ def test_first_weights_come_from_the_generator_alone() -> None:
     for _ in range(2):
         source = generator(3)
         networks.append((DensePredictor(codec, generator=source), Conditioner(codec, generator=source)))
-        torch.rand(1)  # moves the process-wide generator on
+        torch.rand(1)  # advances the process-wide generator
     torch.random.set_rng_state(before)
     DensePredictor(codec, generator=generator(4))
     assert torch.equal(torch.random.get_rng_state(), before)
@@ -100,7 +100,7 @@ def test_first_weights_come_from_the_generator_alone() -> None:
         assert all(torch.equal(x, y) for x, y in zip(a.parameters(), b.parameters(), strict=True))
 
 
-def test_dropout_zeroes_its_share_keeps_the_mean_and_rests_without_a_generator() -> None:
+def test_dropout_zeroes_its_share_keeps_the_mean_and_needs_a_generator() -> None:
     layer, ones = Dropout(0.4), torch.ones(200, 201)
     assert layer(ones) is ones
     layer.generator = generator()

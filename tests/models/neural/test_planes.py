@@ -43,7 +43,7 @@ def test_the_compiled_network_is_the_trained_one(name: str) -> None:
     np.testing.assert_allclose(found[possible], expected[possible], atol=1e-4)
 
 
-def test_a_row_does_not_depend_on_the_rows_beside_it() -> None:
+def test_a_row_does_not_depend_on_other_rows() -> None:
     space = FactoredSpace(SPACES["bits"])
     model = build_networks(space, 3, 0.01)
     states, actions = states_of(space, 19), np.arange(19) % 3
@@ -56,8 +56,8 @@ def test_a_row_does_not_depend_on_the_rows_beside_it() -> None:
             np.testing.assert_array_equal(one[0], many[i])
 
 
-def test_moving_the_world_moves_the_prediction() -> None:
-    # Shared weights: far from the border, a pattern shifted by a cell is predicted shifted by a cell.
+def test_predictions_are_translation_equivariant() -> None:
+    # Shared weights: far from the border, the prediction for a pattern shifted by a cell is shifted by a cell.
     space = FactoredSpace(spaces.MultiBinary((1, 12, 12)))
     body = body_for(space)
     plane = np.zeros((2, 1, 12, 12), dtype=np.int64)
@@ -84,7 +84,7 @@ def explore(game: Maneuverer, n: int, seed: int) -> TransitionBatch:
     return TransitionBatch(*(np.concatenate([getattr(step, name) for step in steps]) for name in names))
 
 
-def test_what_it_learned_of_walls_holds_in_layouts_it_never_saw() -> None:
+def test_the_effect_of_walls_generalises_to_new_layouts() -> None:
     game = Maneuverer(size=5)
     space = FactoredSpace(game.observation_space)
     data = TransitionDataset(space.cardinalities, 4)
@@ -98,7 +98,7 @@ def test_what_it_learned_of_walls_holds_in_layouts_it_never_saw() -> None:
     report = model.fit(data)
     unseen = explore(game, 2000, seed=2)
     cells = unseen.states.reshape(-1, 3, 25)
-    quiet = ~(cells[:, 0] & cells[:, 2]).any(axis=1)  # where the target was reached, all is drawn anew
+    quiet = ~(cells[:, 0] & cells[:, 2]).any(axis=1)  # where the target was reached, a new layout is drawn
     probabilities = model.probabilities(unseen.states, unseen.actions)
     right = (probabilities[:, :-1].argmax(axis=2) == unseen.next_states).all(axis=1)
     assert right[quiet].mean() > 0.95

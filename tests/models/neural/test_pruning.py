@@ -1,4 +1,4 @@
-"""Connections that the data do not call for: luck goes, causes stay, and what is left says the same on average."""
+"""Unsupported connections: noise is removed, true parents remain, and the mean prediction is unchanged."""
 
 import numpy as np
 import pytest
@@ -22,22 +22,22 @@ def coins(n: int = 800) -> TransitionDataset:
     return dataset((2,) * N_BITS, 2, states, rng.integers(2, size=n), after)
 
 
-def test_coins_keep_no_causes() -> None:
+def test_coins_keep_no_parents() -> None:
     data = coins()
     model = fitted(data)
     model.prune(data, 0.5)
     found = influence(model)
     links = [found.states > 0.0, found.actions > 0.0, found.others > 0.0, found.conditions > 0.0]
-    assert sum(int(link.sum()) for link in links) <= 2  # of some 200: luck may look like a cause once in a hundred times
+    assert sum(int(link.sum()) for link in links) <= 2  # of some 200: by chance, about one in a hundred is kept
 
 
-def test_causes_stay_and_nothing_else() -> None:
+def test_only_true_parents_remain() -> None:
     data = shifted()
     model = fitted(data)
     report = model.prune(data, 0.5)
     found = influence(model)
     truth = np.eye(N_BITS, k=1, dtype=bool)
-    truth[-2, -1] = False  # the last two are drawn anew, equal to each other
+    truth[-2, -1] = False  # the last two are random and equal to each other
     wrong = (found.states[:-1] > 0.0) != truth
     assert not (truth & wrong).any()
     assert wrong.sum() <= 4  # of 64
@@ -45,7 +45,7 @@ def test_causes_stay_and_nothing_else() -> None:
     assert report.conditioner_loss == pytest.approx(np.log(2.0), abs=0.03)
 
 
-def test_variables_of_many_values_keep_their_causes() -> None:
+def test_variables_of_many_values_keep_their_parents() -> None:
     rng = np.random.default_rng(1)
     states, actions = rng.integers(3, size=(1500, 4)), rng.integers(2, size=1500)
     after = np.column_stack([(states[:, 1] + actions) % 3, states[:, 1], rng.integers(3, size=1500), states[:, 3]])
@@ -65,10 +65,10 @@ def rows(n: int = 500) -> Examples:
     return examples(shifted(n).rows())
 
 
-def test_what_a_connection_gives_on_average_goes_to_the_bias() -> None:
+def test_the_mean_contribution_of_a_connection_is_added_to_the_bias() -> None:
     given = rows()
     judge = Judge(given, torch.arange(N_BITS + 1), torch.zeros(len(given), N_BITS + 1), 10**9, 1)
-    judge.price = np.inf  # all must go
+    judge.price = np.inf  # all connections are removed
     weight, bias = torch.ones(1, 3), torch.zeros(1)
     inputs = torch.from_numpy(np.random.default_rng(0).random((len(given), 3)).astype(np.float32))
     expected = float(judge.mean(inputs).sum())
@@ -80,18 +80,18 @@ def test_what_a_connection_gives_on_average_goes_to_the_bias() -> None:
     assert (judge.logits[:, :4] == 0.0).all()
 
 
-def test_the_judge_charges_what_the_outcomes_lose() -> None:
+def test_the_judge_measures_the_loss_of_outcomes() -> None:
     given = rows()
     judge = Judge(given, torch.arange(N_BITS + 1), torch.zeros(len(given), N_BITS + 1), len(given), 1)
     assert judge.price == pytest.approx(0.5 * np.log(len(given)) / len(given))
     right = 4.0 * given.outcomes[:, :1].float() - 2.0
     column = torch.tensor([0])
-    assert judge.accepts(column, right)  # nearer to what was met
+    assert judge.accepts(column, right)  # closer to the observed outcomes
     assert not judge.accepts(column, -right)  # and back again
     assert torch.equal(judge.logits[:, :1], right)
 
 
-def test_networks_of_two_hidden_layers_lose_what_leads_to_nothing() -> None:
+def test_nodes_without_a_path_to_an_output_are_removed() -> None:
     data = coins(300)
     config = NeuralConfig(hidden=(12, 6), conditioner=None, training=TrainingConfig(min_steps=300, max_steps=300, batch_size=64))
     model = NeuralTransitionModel(data.cardinalities, data.n_actions, config)

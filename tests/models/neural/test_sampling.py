@@ -41,7 +41,7 @@ def pruned_distribution(tables: list[Floats], row: int) -> Floats:
 
 
 @pytest.mark.parametrize("config", CONFIGS)
-def test_with_many_points_every_outcome_is_found_with_its_exact_probability(config: NeuralConfig) -> None:
+def test_with_many_points_every_outcome_is_listed_with_its_exact_probability(config: NeuralConfig) -> None:
     model = scrambled(config=config)
     states, actions = random_rows(MIXED, 3, 5)
     tables = conditionals(model, states, actions)
@@ -80,7 +80,7 @@ def product(probs: Floats) -> Floats:
     return joint.ravel()
 
 
-def test_what_fits_is_listed_with_exact_probabilities_however_rare() -> None:
+def test_few_outcomes_are_all_listed_with_exact_probabilities() -> None:
     probs = np.array([[0.985, 0.015], [0.5, 0.5], [0.02, 0.98], [1.0, 0.0]])
     for seed in range(20):
         (found,) = rows_of(independent_successors(probs[None], np.full(4, 2), 8, seed), (2, 2, 2))
@@ -89,8 +89,8 @@ def test_what_fits_is_listed_with_exact_probabilities_however_rare() -> None:
 
 
 @pytest.mark.parametrize("n", [3, 4, 16])
-def test_every_rare_value_takes_part_with_its_own_probability(n: int) -> None:
-    rare = np.array([0.012, 0.03])  # above what counts as noise of a network
+def test_every_rare_value_has_its_exact_probability(n: int) -> None:
+    rare = np.array([0.012, 0.03])  # above the threshold for noise of a network
     probs = np.array([[0.5, 0.5]] * 6 + [[1.0 - p, p] for p in rare] + [[0.5, 0.5]] * 2)
     total, n_seeds = np.zeros(2**10), 2000
     for seed in range(n_seeds):
@@ -99,7 +99,7 @@ def test_every_rare_value_takes_part_with_its_own_probability(n: int) -> None:
         assert weights.sum() == pytest.approx(1.0)
         bits = numbers[:, None] >> np.arange(9, -1, -1) & 1
         assert weights[bits[:, 6] == 1].sum() == pytest.approx(rare[0])
-        # of the second, what comes with the first is drawn
+        # the part of the second that coincides with the first is sampled
         assert weights[(bits[:, 7] == 1) & (bits[:, 6] == 0)].sum() == pytest.approx(rare[1] * (1.0 - rare[0]))
         total[numbers] += weights
     exact = product(probs)
@@ -107,7 +107,7 @@ def test_every_rare_value_takes_part_with_its_own_probability(n: int) -> None:
     assert total[(np.arange(2**10) >> 2 & 3) == 3].sum() / n_seeds == pytest.approx(rare.prod(), rel=1.0)
 
 
-def test_strata_that_find_no_room_are_merged_without_bias_and_the_end_never_is() -> None:
+def test_excess_strata_are_merged_without_bias_except_termination() -> None:
     rates, end = np.linspace(0.011, 0.02, 40), 0.0105
     probs = np.array([[1.0 - p, p] for p in (*rates, end)])
     total, n_seeds, n = np.zeros(40), 4000, 8
@@ -117,11 +117,11 @@ def test_strata_that_find_no_room_are_merged_without_bias_and_the_end_never_is()
         assert found.probabilities.sum() == pytest.approx(1.0)
         assert found.probabilities[found.terminated].sum() >= end * (1.0 - rates).prod() * 0.999
         total += found.probabilities @ found.states
-    # each variable is drawn about n / 40 as often as it should be for its exact mean
+    # each variable is sampled about n / 40 times as often as required for its exact mean
     assert total / n_seeds == pytest.approx(rates, rel=0.25)
 
 
-def test_of_many_equally_unlikely_values_none_is_set_apart() -> None:
+def test_many_equally_unlikely_values_get_no_strata() -> None:
     probs = np.full((1, 1, 100), 0.0099)
     probs[0, 0, 99] = 1.0 - 0.0099 * 99
     found = independent_successors(np.concatenate([probs, np.eye(100)[:1][None]], axis=1), np.array([100, 2]), 16, seed=0)
@@ -137,12 +137,12 @@ def test_many_fair_bits_do_not_run_out_of_precision() -> None:
     first, second = found.states[:n], found.states[n : 2 * n]
     assert np.array_equal(first, second)  # random numbers shared by all rows
     assert first[:, :4].sum() == n * 4 / 2  # the first log2(n) bits are stratified
-    assert first[:, 4:].mean() == pytest.approx(0.5, abs=0.05)  # the rest is fresh luck,
+    assert first[:, 4:].mean() == pytest.approx(0.5, abs=0.05)  # the others use new random numbers,
     differing = (first[:, None, 4:] != first[None, :, 4:]).mean(axis=2)[np.triu_indices(n, 1)]
-    assert (np.abs(differing - 0.5) < 0.15).all()  # of each point its own
+    assert (np.abs(differing - 0.5) < 0.15).all()  # different for each point
 
 
-def test_settled_factors_and_tiny_probabilities_cost_nothing() -> None:
+def test_settled_factors_and_tiny_probabilities_need_no_samples() -> None:
     probs = np.tile([0.995, 0.005], (1, 300, 1))
     found = independent_successors(probs, np.full(300, 2), 16, seed=0)
     assert len(found.states) == 1
@@ -156,7 +156,7 @@ def test_no_rows_no_successors() -> None:
     assert found.states.shape == (0, len(MIXED))
 
 
-def test_large_requests_are_worked_on_in_parts() -> None:
+def test_large_requests_are_processed_in_parts() -> None:
     model = scrambled((2, 2), 2)
     states, actions = random_rows((2, 2), 2, 5000)
     found = model.successors(states, actions, 8, seed=0)
@@ -171,7 +171,7 @@ def test_offsets_of_seeds_are_spread_evenly() -> None:
     assert np.abs(offsets - (np.arange(400) + 0.5) / 400).max() < 0.09
 
 
-def test_long_lists_are_thinned_and_short_ones_kept() -> None:
+def test_long_lists_are_resampled_and_short_ones_kept() -> None:
     rng = np.random.default_rng(0)
     following, ends = outcomes((5, 5))
     long, short = rng.dirichlet(np.ones(50)), np.array([0.25, 0.75])
@@ -194,7 +194,7 @@ def test_long_lists_are_thinned_and_short_ones_kept() -> None:
     assert thin(full, 50, 0) is full
 
 
-def test_thinned_lists_keep_what_is_rare_and_every_end() -> None:
+def test_resampled_lists_keep_rare_outcomes_and_every_termination() -> None:
     rare, n = np.array([0.0007, 0.0003]), 60
     usual = np.full(n, (1.0 - rare.sum()) / n)
     states, probabilities = np.arange(n + 2)[:, None], np.concatenate([usual, rare])

@@ -1,4 +1,4 @@
-"""Networks as lists of connections: what the torch modules say, and no more numbers than are left."""
+"""Networks as lists of connections: predictions of the torch modules, and only the remaining weights."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ N_BITS, N_ACTIONS, N_OUT = 5, 3, 6
 
 
 def thinned(hidden: tuple[int, ...] = (16,), seed: int = 0) -> NeuralTransitionModel:
-    """Random weights, three of four gone."""
+    """Random weights, of which three quarters are removed."""
     config = NeuralConfig(hidden=hidden, group_size=4, activation="tanh")
     model = NeuralTransitionModel((2,) * N_BITS, N_ACTIONS, config, seed=seed)
     rng = torch.Generator().manual_seed(seed)
@@ -27,7 +27,7 @@ def thinned(hidden: tuple[int, ...] = (16,), seed: int = 0) -> NeuralTransitionM
     return model
 
 
-def test_chances_are_those_of_the_modules() -> None:
+def test_probabilities_are_those_of_the_torch_modules() -> None:
     model = thinned()
     assert isinstance(model.predictor, DensePredictor)
     k, plain = (pack_sparse(model.predictor, c, 1.0, np.ones(N_OUT, dtype=np.bool_)) for c in (model.conditioner, None))
@@ -42,26 +42,26 @@ def test_chances_are_those_of_the_modules() -> None:
             see_action(networks, room, state, action)
             with torch.no_grad():
                 expected = [float(chances(pair, columns, i)) for i in range(N_OUT)]
-            asked = [ask(networks, room, i, action, 0, state, outcome, none[0], none) for i in range(N_OUT)]
-            ours = np.where(room.conditioned, asked, room.chances).tolist()
+            conditioned = [ask(networks, room, i, action, 0, state, outcome, none[0], none) for i in range(N_OUT)]
+            ours = np.where(room.conditioned, conditioned, room.chances).tolist()
             assert ours == pytest.approx(expected, abs=1e-5)
 
 
-def test_only_what_the_bits_asked_for_need_is_there() -> None:
+def test_only_connections_of_the_requested_bits_are_included() -> None:
     model = thinned()
     assert isinstance(model.predictor, DensePredictor)
-    asked = np.array([False, True, False, False, True, False])
-    some = pack_sparse(model.predictor, model.conditioner, 0.99, asked)
+    requested = np.array([False, True, False, False, True, False])
+    some = pack_sparse(model.predictor, model.conditioner, 0.99, requested)
     everything = pack_sparse(model.predictor, model.conditioner, 0.99, np.ones(N_OUT, dtype=np.bool_))
     assert some is not None
     assert everything is not None
     assert 0 < len(some.bias) < len(everything.bias)
-    assert len(some.outputs.weight) == int((model.predictor.out.weight[asked] != 0.0).sum())
-    assert some.groups.grouped.tolist() == asked.tolist()
-    assert np.diff(some.groups.begin)[~asked].sum() == 0
+    assert len(some.outputs.weight) == int((model.predictor.out.weight[requested] != 0.0).sum())
+    assert some.groups.grouped.tolist() == requested.tolist()
+    assert np.diff(some.groups.begin)[~requested].sum() == 0
 
 
-def test_an_open_bit_is_seen_only_by_groups_that_are_connected_to_it() -> None:
+def test_only_connected_groups_depend_on_an_open_bit() -> None:
     model = thinned()
     assert isinstance(model.predictor, DensePredictor)
     k = pack_sparse(model.predictor, model.conditioner, 1.0, np.ones(N_OUT, dtype=np.bool_))
@@ -76,7 +76,7 @@ def test_an_open_bit_is_seen_only_by_groups_that_are_connected_to_it() -> None:
             assert leans_on_open(k, i, base) == (n_inputs + j in seen)
 
 
-def test_several_hidden_layers_are_not_covered() -> None:
+def test_several_hidden_layers_are_not_supported() -> None:
     model = thinned((8, 8))
     assert isinstance(model.predictor, DensePredictor)
     assert pack_sparse(model.predictor, model.conditioner, 0.99, np.ones(N_OUT, dtype=np.bool_)) is None

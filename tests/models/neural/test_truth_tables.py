@@ -1,4 +1,4 @@
-"""What a pruned network is compiled to, tables or connections: the same world as that of its matrices."""
+"""Truth tables and connections of pruned networks: the same predictions as those of the matrices."""
 
 from collections.abc import Iterator
 
@@ -17,7 +17,7 @@ from tests.models.neural.test_connections import N_BITS, fitted, shifted
 def learned() -> NeuralTransitionModel:
     data = shifted()
     model = fitted(data)
-    assert model.rules() is None  # an unpruned one goes by its matrices
+    assert model.rules() is None  # an unpruned model uses its matrices
     model.prune(data, 0.8, config=PruningConfig(evidence=False))
     return model
 
@@ -31,7 +31,7 @@ def pruned(learned: NeuralTransitionModel) -> Iterator[NeuralTransitionModel]:
 
 
 def few_tables(model: NeuralTransitionModel, monkeypatch: pytest.MonkeyPatch) -> BitRules:
-    """As if most bits had too many parents left."""
+    """Rules as if most bits had too many remaining parents."""
     monkeypatch.setattr("mbagent.models.neural.truth_tables.MOST_PARENTS", int(np.median((model._marks == PARENT).sum(axis=1))))
     model.load_state_dict(model.state_dict())
     model.pruned_as = "tables"
@@ -49,7 +49,7 @@ def drawn(model: NeuralTransitionModel, pruned_as: PrunedAs) -> np.ndarray:
     return np.column_stack(model.sample(rows.states, rows.actions, derive(1, np.arange(len(rows.states)))))
 
 
-def test_draws_are_those_of_the_matrices(pruned: NeuralTransitionModel, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_are_those_of_the_matrices(pruned: NeuralTransitionModel, monkeypatch: pytest.MonkeyPatch) -> None:
     rules = pruned.rules()
     assert rules is not None
     assert rules.networks is None
@@ -57,12 +57,12 @@ def test_draws_are_those_of_the_matrices(pruned: NeuralTransitionModel, monkeypa
     assert sorted([*rules.bits[:, 0], *rules.copies[:, 0]]) == list(range(N_BITS + 1))
     theirs = drawn(pruned, "matrices")
     assert (drawn(pruned, "tables") != theirs).any(axis=1).mean() <= 0.005
-    assert np.array_equal(drawn(pruned, "connections"), theirs)  # equal but for rounding
+    assert np.array_equal(drawn(pruned, "connections"), theirs)  # equal up to rounding
     few_tables(pruned, monkeypatch)
     assert (drawn(pruned, "tables") != theirs).any(axis=1).mean() <= 0.005
 
 
-def test_connections_are_as_many_as_are_left(pruned: NeuralTransitionModel) -> None:
+def test_only_remaining_connections_are_included(pruned: NeuralTransitionModel) -> None:
     pruned.pruned_as = "connections"
     rules, left = pruned.rules(), pruned.connections()
     assert rules is not None
@@ -85,7 +85,7 @@ def test_tables_survive_saving(pruned: NeuralTransitionModel) -> None:
 
 
 @pytest.mark.parametrize("pruned_as", ["tables", "mixed", "connections"])
-def test_compiled_search_imagines_the_same(
+def test_compiled_search_has_the_same_outcomes(
     pruned: NeuralTransitionModel, pruned_as: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     graphs = []
@@ -106,7 +106,7 @@ def test_compiled_search_imagines_the_same(
     assert 0.5 * apart / (len(states) * pruned.n_actions) <= 0.005
 
 
-def test_tables_lose_what_makes_no_difference() -> None:
+def test_tables_have_no_irrelevant_parents() -> None:
     chances = np.array([[[0.0, 0.0], [1.0, 1.0]]] * 3)  # [action, the outcome's bit 4, the state's bit 2]
     plain = Table((2,), (4,), chances).simplified(chances)
     assert (plain.states, plain.others, plain.chances.tolist()) == ((), (4,), [[0.0, 1.0]])
@@ -116,7 +116,7 @@ def test_tables_lose_what_makes_no_difference() -> None:
     assert (nothing.states, nothing.others, nothing.chances.tolist()) == ((), (), [0.5])
 
 
-def test_improbable_values_are_taken_for_impossible() -> None:
+def test_improbable_values_are_treated_as_impossible() -> None:
     tables = [
         Table((0,), (), np.array([[1e-5, 1.0 - 1e-5]])),
         Table((), (), np.array([0.005])),
@@ -126,5 +126,5 @@ def test_improbable_values_are_taken_for_impossible() -> None:
     assert rules.copies.tolist() == [[0, 0, 0, 1]]
     assert rules.bits[:, 0].tolist() == [1, 2]
     assert rules.table.tolist() == [0.005, 0.1, 1.0]
-    settled = compile_rules(tables, None, 2, settled=True)  # as search sees them
+    settled = compile_rules(tables, None, 2, settled=True)  # as used by search
     assert settled.copies.tolist() == [[0, 0, 0, 1], [1, 0, 0, 0]]
