@@ -97,7 +97,7 @@ class SampledGame(SimulatorModel):
 
     def __init__(self, game: GeyserRunner) -> None:
         super().__init__(game)
-        self._lists = False
+        self.lists = False
 
 
 def values_of(mdp: ReachableMDP, game: GeyserRunner, gamma: float) -> dict[bytes, float]:

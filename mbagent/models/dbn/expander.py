@@ -121,14 +121,14 @@ def graph_outcomes(
     shown, features, on = g.shown, g.features, work.on
     variables, members, entries = g.variables, g.members, g.entries
     entry, node, leaf = g.entry, g.node, g.leaf
-    smoothing, base_rates, still, noise = g.smoothing, g.base, g.still, g.noise[0]
+    stay, unseen, still, noise = g.smoothing, g.base, g.still, g.noise[0]
     exactly, row, touched = g.exactly, g.row, g.touched
     by_adjacency, always, rates = g.by_adjacency, g.always, work.rates
     joint, different, words = work.joint, work.different, work.words
-    listed, values, mutex_members = work.variables, work.values, work.mutex_members
+    listed, now, mutex_members = work.variables, work.values, work.mutex_members
     per_mutex, opened, base = work.per_mutex, work.opened, work.base
     p, encoding = work.p, g.encoding
-    counts, observed, weights, end_is_synchronic = g.counts, g.observed, g.weights, len(g.end_first) > 0
+    counts, observed, weights, ends = g.counts, g.observed, g.weights, len(g.end_first) > 0
     n_actions, first_adjacency = len(always), len(features) + encoding.n_features
     place = place_of(state)
     n_different = show_state(state, shown, features, different, on)
@@ -139,46 +139,18 @@ def graph_outcomes(
             action, state, different[:n_different], row, touched, by_adjacency, always, first_adjacency, on, usual, words, listed
         )
         _show_action(encoding, action, len(features), True, on)
-        action_class = encoding.action_class[action]
+        kind = encoding.action_class[action]
         rates_of(
-            listed[:n],
-            state,
-            action_class,
-            on,
-            variables,
-            members,
-            entries,
-            entry,
-            node,
-            leaf,
-            smoothing,
-            base_rates,
-            still,
-            noise,
-            values,
-            rates,
+            listed[:n], state, kind, on, variables, members, entries, entry, node, leaf, stay, unseen, still, noise, now, rates
         )
         for f in range(len(state)):
             base[f] = state[f]
-        begin(p, n_grid, _fits(listed[:n], variables, rates, per_mutex, end_is_synchronic, n_grid), place)
+        begin(p, n_grid, _fits(listed[:n], variables, rates, per_mutex, ends, n_grid), place)
         n_open, ended = _settle(
-            listed[:n],
-            variables,
-            members,
-            exactly,
-            values,
-            rates,
-            joint,
-            mutex_members,
-            per_mutex,
-            opened,
-            p,
-            base,
-            end_is_synchronic,
-            grid,
+            listed[:n], variables, members, exactly, now, rates, joint, mutex_members, per_mutex, opened, p, base, ends, grid
         )
-        if end_is_synchronic:
-            _end(g, work, action_class, n_open, grid)
+        if ends:
+            _end(g, work, kind, n_open, grid)
             n_open += 1
         _show_action(encoding, action, len(features), False, on)
         n_live = _write(total, n_open, ended, base, opened, mutex_members, variables, members, p, n_grid, out)
