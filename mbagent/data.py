@@ -239,11 +239,11 @@ class TransitionDataset:
         """Writes the table as a compressed ``.npz`` of plain arrays, without pickled objects.
 
         Args:
-            path: a path (".npz" is added unless it ends with it) or an open binary file.
+            path: a path, to which ".npz" is appended unless it already ends with that, or an open binary file.
 
         Raises:
             TypeError, ValueError: ``path`` is neither.
-            OSError: the file cannot be written; an existing file is unchanged.
+            OSError: the file cannot be written; an existing file at a path is unchanged.
         """
         rows = self.rows()
         with files.writing(path, ".npz", always=True) as file:

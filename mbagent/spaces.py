@@ -382,7 +382,7 @@ class FactoredSpace:
         return factors
 
     def widen(self, factors: NDArray[Any]) -> NDArray[Any]:
-        """Declared numbers, int [B, F], of factors."""
+        """The declared numbers, int [B, F], that correspond to ``factors``; the inverse of ``narrow`` for observed values."""
         if self._nearest is None:
             return factors
         numbers = factors.astype(np.int64)

@@ -75,7 +75,7 @@ class _Tile:
         self.opacity = total
 
     def circle(self, x: float, y: float, radius: float) -> _Plane:
-        """Return the distance from a circle."""
+        """Return the signed distance of each pixel from a circle, in cells; negative inside."""
         distance: _Plane = np.hypot(self.x - x, self.y - y) - radius
         return distance
 

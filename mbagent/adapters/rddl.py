@@ -131,7 +131,7 @@ def _values_of(space: spaces.Space[Any], name: str) -> tuple[int, int]:
 
 
 def _joint_actions(env: Any) -> tuple[Assignment, ...]:
-    """All joint actions with at most the allowed number of non-default fluents, ordered by that number."""
+    """All joint actions in which no more than the allowed number of fluents differ from their defaults, fewest first."""
     defaults: dict[str, Any] = env._noop_actions  # pyRDDLGym has no public name for them
     choices: dict[str, list[Any]] = {}
     for name, part in env.action_space.spaces.items():

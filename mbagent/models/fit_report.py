@@ -87,7 +87,10 @@ class FitReport:
 
 
 def calibration_error(probabilities: Floats, came: NDArray[np.bool_]) -> float:
-    """Mean distance of predicted probabilities from the frequencies of their bins (Naeini et al. 2015); both of any shape."""
+    """Expected calibration error (Naeini et al. 2015) of probabilities, given outcomes of the same shape.
+
+    The distance between mean predicted probability and observed frequency, averaged over bins weighted by their numbers of predictions.
+    """
     bins = np.minimum((probabilities.ravel() * BINS).astype(np.int64), BINS - 1)
     predicted = np.bincount(bins, weights=probabilities.ravel(), minlength=BINS)
     observed = np.bincount(bins, weights=came.ravel().astype(np.float64), minlength=BINS)

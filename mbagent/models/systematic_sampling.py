@@ -184,7 +184,7 @@ def prune(values: Floats, n: int) -> None:
 
 @compiled
 def settle(probs: Floats, b: int, outputs: Ints, base: Ints) -> None:
-    """Writes to ``base`` [O] the value of each factor of row b that has only one non-negligible value, else -1."""
+    """For each factor in row b of ``probs``, writes its only non-negligible value to ``base`` [O], or -1 if there are several."""
     for i in range(len(outputs)):
         if outputs[i] == 2:  # a case of its own for speed, since most factors are bits with a certain value
             zero, one = probs[b, i, 0], probs[b, i, 1]

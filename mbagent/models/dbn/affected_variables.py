@@ -1,8 +1,9 @@
-"""Decision graphs as few flat arrays, with an index of the variables that a state affects, so that search evaluates only these.
+"""Decision graphs in flat arrays, with an index of the variables that a state affects, so that search evaluates only these.
 
-In the all-zero state, each variable has a *usual* distribution for each action; mostly it keeps its value. In another state, a
-variable can only differ from this if a feature that is tested on its usual path differs, or if its own value does. If few cells
-of a board are occupied, these variables are few, regardless of the size of the board.
+In the all-zero state, each variable has a *usual* distribution for each action; most variables keep their values. In another
+state, a variable's distribution can differ from the usual one only if a feature tested on its usual path differs, or if its own
+value does. Only variables that can differ in this way, or that may change even in the all-zero state, are evaluated. If few
+cells of a board are occupied, these are few, regardless of the size of the board.
 Shapes: A actions, U variables, F factors, R values of all factors, W words of 64 variables, M adjacency features, Q mutex groups.
 """
 

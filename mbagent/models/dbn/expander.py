@@ -26,8 +26,8 @@ from mbagent.models.dbn.affected_variables import (
 )
 from mbagent.models.dbn.arrays import are_adjacent
 from mbagent.models.dbn.features import ActionEncoding
-from mbagent.models.dbn.invariants import leave_out
 from mbagent.models.dbn.mutex import leave_out_none
+from mbagent.models.dbn.planes.invariants import leave_out
 from mbagent.models.dbn.sampling import only_possible
 from mbagent.models.overloads import Outcomes, implements, outcomes, work_for
 from mbagent.models.systematic_sampling import (
@@ -53,7 +53,7 @@ _SURE = 1 << 40
 
 
 class GraphWork(NamedTuple):
-    """Work space; between two calls, ``on`` has the features of the all-zero state.
+    """Work space; between two calls, ``on`` holds the features of the all-zero state.
 
     Attributes:
         on: features, bool [D].
@@ -63,10 +63,10 @@ class GraphWork(NamedTuple):
         words: affected variables as bits, uint64 [W].
         variables: affected variables, int64 [U].
         values: their current values, int64 [U].
-        mutex_members: those of them that are in mutex groups, one group after the other, int64 [U].
-        per_mutex: how many are in each group, int64 [Q].
-        opened: the uncertain outcomes: a variable and -1, or where a mutex group's variables begin and how many they are,
-            int64 [U + Q, 2].
+        mutex_members: the affected variables that are in mutex groups, group by group, int64 [U].
+        per_mutex: number of affected variables in each mutex group, int64 [Q].
+        opened: one row for each uncertain outcome, int64 [U + Q, 2]: (variable, -1), or for a mutex group (index of its first
+            variable in ``mutex_members``, number of its variables).
         p: particles.
         base: the next state except for uncertain outcomes, int64 [F].
         following: the next state that a particle represents, int64 [F].

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.data import Factors
-from mbagent.models.dbn.invariants import NO_INVARIANTS
+from mbagent.models.dbn.planes.invariants import NO_INVARIANTS
 from mbagent.models.dbn.score import Target
 from mbagent.types import Bools, Ints
 from mbagent_envs.random_keys import derive, hash_rows
@@ -98,7 +98,7 @@ class Layout(NamedTuple):
         mutex_members: variables, all bits, of which at most one is on after a step.
         exactly: whether exactly one is on, bool [Q].
         mutex_of: mutex group of each variable, or -1, int64 [U].
-        counts, observed: invariants of planes, see ``invariants.py``.
+        counts, observed: invariants of planes, see ``planes/invariants.py``.
         weights: weight of each channel's value in the number of a combination of values, int64 [C].
     """
 
@@ -213,7 +213,7 @@ def variable_values(layout: Layout, states: Factors) -> Factors:
 
 
 def feature_table(layout: Layout, states: Factors, actions: Ints) -> Bools:
-    """Features of states [B, F], then those of actions [B], bool [B, D]."""
+    """Features of ``states`` [B, F] followed by those of ``actions`` [B], bool, without adjacency features."""
     return np.concatenate(
         [shown(layout, states), action_feature_table(layout.encoding, actions)],
         axis=1,

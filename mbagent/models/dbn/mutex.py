@@ -136,7 +136,10 @@ def mutex_distribution(mutex: int, state: Ints, rates: Floats, still: Bools, lay
 
 @compiled
 def n_choices(mutex: int, state: Ints, rates: Floats, still: Bools, layout: Layout, graphs: Graphs) -> int:
-    """Number of possible outcomes of a mutex group: of bits that may be on, and of none unless a bit is certain; at least 1."""
+    """Upper bound on the number of possible outcomes of a mutex group, at least 1.
+
+    One for each bit that may be on, and one for "no bit is on" unless a bit is certain.
+    """
     possible, sure = 0, False
     for k in range(layout.mutex_first[mutex], layout.mutex_first[mutex + 1]):
         variable = layout.mutex_members[k]

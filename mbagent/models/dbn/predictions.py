@@ -9,7 +9,7 @@ from mbagent.models.dbn import sampling
 from mbagent.models.dbn.affected_variables import AffectedIndex
 from mbagent.models.dbn.arrays import Graphs
 from mbagent.models.dbn.fitting import Fitted, for_planning, no_synchronic
-from mbagent.models.dbn.invariants import COVERING, MOST_TRIES, Invariants, all_kept, enforced, kept_chances
+from mbagent.models.dbn.planes.invariants import COVERING, MOST_TRIES, Invariants, all_kept, enforced, kept_chances
 from mbagent.models.dbn.successors import WholeKernel, kernel_of, mixed, reset_draws, successors
 from mbagent.models.protocol import Successors, as_keys
 from mbagent.models.systematic_sampling import assemble, rows_at_once, start
@@ -116,7 +116,7 @@ class GraphPredictions(BaseTransitionModel):
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
         """See TransitionModel; exact for the distribution that ``sample`` draws from.
 
-        If there are invariants (see ``invariants.py``), the probability that all of them hold is estimated from systematic draws.
+        If there are invariants (``planes/invariants.py``), the probability that all hold is estimated from systematic draws.
         """
         states, actions = self._rows(states, actions)
         following, over = np.ascontiguousarray(next_states, dtype=np.int64), np.ascontiguousarray(terminated, dtype=np.bool_)

@@ -26,7 +26,14 @@ from mbagent.models.dbn.features import (
     make_layout,
 )
 from mbagent.models.dbn.leaf_prior import best_prior
-from mbagent.models.dbn.plane_features import ADJACENCY, NEXT_ADJACENCY, Reach, far_value, informative_features, relative_features
+from mbagent.models.dbn.planes.features import (
+    ADJACENCY,
+    NEXT_ADJACENCY,
+    Reach,
+    far_value,
+    informative_features,
+    relative_features,
+)
 from mbagent.models.dbn.split_search import find_splits
 from mbagent.spaces import PlaneLayout
 from mbagent.types import Bools, Floats, Ints

@@ -140,7 +140,9 @@ def sample(
 
 @compiled
 def needs_synchronic(variable: int, action: int, w: Work, layout: Layout, graphs: Graphs) -> bool:
-    """Whether a variable with synchronic arcs needs them here: more than one next value was observed or is not negligible.
+    """Whether a variable's synchronic arcs are needed for the current state and action.
+
+    For ``terminated`` always; for another variable, if several next values were observed or have non-negligible probability.
 
     Args:
         variable: its number.

@@ -19,8 +19,8 @@ from mbagent.models.dbn.affected_variables import AffectedIndex, affected_index,
 from mbagent.models.dbn.arrays import Graphs, distributions, n_features, show, show_next, show_next_adjacencies, write
 from mbagent.models.dbn.features import Layout
 from mbagent.models.dbn.fitting import Fitted, no_synchronic
-from mbagent.models.dbn.invariants import leave_out
 from mbagent.models.dbn.mutex import leave_out_none, mutex_distribution, n_choices, settle
+from mbagent.models.dbn.planes.invariants import leave_out
 from mbagent.models.dbn.sampling import Work, alone, needs_synchronic, only_possible, work_space
 from mbagent.models.overloads import Outcomes, implements, outcomes, work_for
 from mbagent.models.protocol import Successors

@@ -69,7 +69,7 @@ def number_strings(strings: Actions, n_actions: int) -> Actions:
 
 
 def longest_string(n_actions: int) -> int:
-    """Length of the longest strings that can be numbered."""
+    """Length of the longest strings that can be numbered; 1000 if there is only one action, when there is no limit."""
     n = 1
     while n_actions > 1 and n_actions ** (n + 1) <= LARGEST_NUMBER:
         n += 1

@@ -71,13 +71,14 @@ class SweepWork(NamedTuple):
         active: input columns that are 1, int64 [O + n_steps].
         on: whether a column is 1 in the state, int64 [C].
         columns: all columns that are 1 at present, int64 [C + O + n_steps].
-        shift: offset from a column to its index in a group, by whether it is 1 in the state and in the next state, int64 [4].
+        shift: offset from a column to its index among a group's weight columns, by [1 in the state] + 2 [1 in the next state],
+            int64 [4].
         chosen: factors that this sweep may change, int64 [O].
         noise: random number of each factor, [O].
         rank: second random number of each factor, which determines the order, [O].
         ranks: ranks of the chosen factors, [O].
         order: the chosen factors in that order, int64 [O].
-        hidden: hidden nodes of one group, [1, G].
+        hidden: values of one group's hidden nodes, [1, G].
         row_logits: logits of one factor, [K].
         given: distribution of that factor, [K].
     """

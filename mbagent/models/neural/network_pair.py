@@ -206,7 +206,7 @@ class NetworkPair(BaseTransitionModel):
 
     @property
     def parents(self) -> NDArray[np.int8]:
-        """Parents of each outcome bit of a pruned model, see ``truth_tables.find_parents``; empty for any other model."""
+        """For each outcome bit of a pruned model, its parents and the fixed values of the other bits; empty for other models."""
         return self._marks
 
     def connections(self) -> dict[str, Connections]:

@@ -28,14 +28,15 @@ PRUNING_ROWS = 20_000
 
 
 class Judge:
-    """Decides whether changes of a network's output on transitions are acceptable.
+    """Decides whether changes to a network's output on transitions are acceptable.
 
     Args:
         rows: the transitions.
         factor: factor of each column, int64 [C]; a bit has one column, the logit of value 1.
         logits: logits of the columns, [N, C]; updated by accepted changes.
         n_transitions: number of transitions that the rows represent.
-        n_candidates: number of candidate inputs of each connection; both numbers determine the penalty per connection.
+        n_candidates: number of inputs among which each connection was chosen; with ``n_transitions``, it determines the
+            penalty per connection.
     """
 
     def __init__(self, rows: Examples, factor: Tensor, logits: Tensor, n_transitions: int, n_candidates: int) -> None:
@@ -60,7 +61,7 @@ class Judge:
         return mean
 
     def spread(self, values: Tensor) -> Tensor:
-        """The standard deviation over rows of each column of ``values`` [N, M]."""
+        """The weighted standard deviation over rows of each column of ``values`` [N, M]."""
         return self.mean((values - self.mean(values)) ** 2).sqrt()
 
     def accepts(self, columns: Tensor, change: Tensor, connections: int = 1) -> bool:

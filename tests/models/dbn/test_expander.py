@@ -15,7 +15,7 @@ from mbagent.planning.lookahead import grow_lookahead
 from mbagent.spaces import FactoredSpace
 from mbagent_envs import FlierCatcher, GeyserRunner, Maneuverer
 from mbagent_envs.game import Game
-from tests.models.dbn.test_invariants import fitted
+from tests.models.dbn.planes.test_invariants import fitted
 from tests.models.dbn.test_model import CARDINALITIES, small_world
 from tests.models.helpers import dataset, played
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from mbagent.models.dbn.arrays import Graphs, linked, n_features
 from mbagent.models.dbn.features import ActionEncoding, Layout, layout_with_mutexes, make_layout
-from mbagent.models.dbn.invariants import NO_INVARIANTS, Invariants, radix
-from mbagent.models.dbn.plane_features import ACTION, ADJACENCY, BORDER, NEXT, NEXT_ADJACENCY, WRAP
+from mbagent.models.dbn.planes.features import ACTION, ADJACENCY, BORDER, NEXT, NEXT_ADJACENCY, WRAP
+from mbagent.models.dbn.planes.invariants import NO_INVARIANTS, Invariants, radix
 from mbagent.spaces import PlaneLayout
 from mbagent.types import Ints
 
@@ -54,7 +54,7 @@ class LocalGraphs:
         graphs: variables are the channels, then ``terminated`` and the reset; features are relative.
         synchronic: graphs of channels whose cells have synchronic arcs; cells are drawn from the upper left on, channel after
             channel.
-        features: the relative features, int64 [D, 7], see ``plane_features.py``.
+        features: the relative features, int64 [D, 7], see ``features.py``.
         cardinalities: number of values of each channel's cells, length C.
         encoding: the actions.
         mutexes: mutex groups of cells.

@@ -12,8 +12,7 @@ from mbagent import ModelLearningAgent
 from mbagent.data import TransitionDataset
 from mbagent.models.dbn import DecisionGraphModel, LocalGraphModel
 from mbagent.models.dbn.features import BEYOND
-from mbagent.models.dbn.grounding import COLUMN, WHOLE, Mutex
-from mbagent.models.dbn.plane_features import (
+from mbagent.models.dbn.planes.features import (
     ACTION,
     BORDER,
     CELL,
@@ -25,6 +24,7 @@ from mbagent.models.dbn.plane_features import (
     feature_values,
     relative_features,
 )
+from mbagent.models.dbn.planes.grounding import COLUMN, WHOLE, Mutex
 from mbagent.spaces import FactoredSpace
 from mbagent_envs import FlierCatcher, Maneuverer
 from mbagent_envs.random_keys import derive

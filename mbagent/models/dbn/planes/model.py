@@ -21,11 +21,8 @@ from mbagent.models.dbn.arrays import Graphs, build
 from mbagent.models.dbn.change_points import last_changes
 from mbagent.models.dbn.features import Layout, Observed, Question, ask, distinct
 from mbagent.models.dbn.fitting import UNCERTAIN, Fitted, fit_graphs, go_together, no_synchronic, uncertain_rows
-from mbagent.models.dbn.grounding import COLUMN, ROW, WHOLE, LocalGraphs, Mutex, instantiate, with_invariants, with_mutexes
-from mbagent.models.dbn.invariants import NO_INVARIANTS, Invariants, all_kept, find_invariants, n_combinations
-from mbagent.models.dbn.large_data import PlaneTable, channel_layout, refine
 from mbagent.models.dbn.model import IMPOSSIBLE_LOG_PROB, DecisionGraphModel, depends_on_action, tested_features
-from mbagent.models.dbn.plane_features import (
+from mbagent.models.dbn.planes.features import (
     NEXT,
     NEXT_ADJACENCY,
     Reach,
@@ -34,6 +31,9 @@ from mbagent.models.dbn.plane_features import (
     relative_features,
     shifted,
 )
+from mbagent.models.dbn.planes.grounding import COLUMN, ROW, WHOLE, LocalGraphs, Mutex, instantiate, with_invariants, with_mutexes
+from mbagent.models.dbn.planes.invariants import NO_INVARIANTS, Invariants, all_kept, find_invariants, n_combinations
+from mbagent.models.dbn.planes.large_data import PlaneTable, channel_layout, refine
 from mbagent.models.dbn.serialization import SAVED, from_arrays, table_of, to_arrays
 from mbagent.models.dbn.smoothing import smoothing_of
 from mbagent.models.dbn.splits import Search

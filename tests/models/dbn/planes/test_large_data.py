@@ -10,9 +10,10 @@ from gymnasium import spaces
 
 from mbagent import data as data_module
 from mbagent.data import TransitionBatch, TransitionDataset
-from mbagent.models.dbn import DecisionGraphModel, LocalGraphModel, large_data
+from mbagent.models.dbn import DecisionGraphModel, LocalGraphModel
 from mbagent.models.dbn import model as graph_model
-from mbagent.models.dbn.plane_features import NEXT, NEXT_ADJACENCY, Reach, feature_values, relative_features, values_at
+from mbagent.models.dbn.planes import large_data
+from mbagent.models.dbn.planes.features import NEXT, NEXT_ADJACENCY, Reach, feature_values, relative_features, values_at
 from mbagent.spaces import FactoredSpace
 from mbagent.wrappers import History
 from mbagent_envs import Maneuverer

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mbagent.data import Factors, TransitionBatch
 from mbagent.models.dbn.arrays import Graphs, build
 from mbagent.models.dbn.features import ActionEncoding, Layout, Observed, Question, ask, distinct, make_layout
-from mbagent.models.dbn.plane_features import (
+from mbagent.models.dbn.planes.features import (
     ACTION,
     ADJACENCY,
     BORDER,
@@ -152,7 +152,7 @@ class PlaneTable:
         return Observed(self.pattern, self.actions, now, then).select(self.cells_since(channel))
 
     def determined_by(self, channel: int) -> Ints | None:
-        """Features that alone determine a channel (``plane_features.determined_by``); None if none do or it rarely changed."""
+        """Features that alone determine a channel (``features.determined_by``); None if none do or it rarely changed."""
         before, after = (planes[:, channel] for planes in self.every)
         if (before != after).sum() < FEWEST_CHANGES:
             return None
@@ -178,7 +178,7 @@ class PlaneTable:
         return np.stack(found, axis=1)
 
     def split(self, asked: Sequence[Question], table: Bools, numbers: Ints) -> list[Search]:
-        """Finished searches with a table of the relative features ``numbers``."""
+        """Searches for the splits of the questions ``asked``, completed on ``table``, whose columns are the features ``numbers``."""
         kinds = feature_kinds(self.features)[numbers]
         found = find_splits([q.target for q in asked], table, kinds, self.encoding.n_action_classes, self.in_pairs)
         return [search.renamed(numbers) for search in found]

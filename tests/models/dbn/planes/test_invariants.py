@@ -5,7 +5,7 @@ import pytest
 from gymnasium import spaces
 
 from mbagent.models.dbn import LocalGraphModel
-from mbagent.models.dbn.invariants import NO_INVARIANTS, Invariants, all_kept, enforced, find_invariants, radix
+from mbagent.models.dbn.planes.invariants import NO_INVARIANTS, Invariants, all_kept, enforced, find_invariants, radix
 from mbagent.models.protocol import Successors
 from mbagent.spaces import FactoredSpace
 from tests.models.helpers import dataset

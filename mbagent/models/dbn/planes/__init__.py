@@ -1,0 +1,1 @@
+"""Planes: models whose parameters are tied over the positions of a board."""
