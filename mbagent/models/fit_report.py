@@ -89,7 +89,7 @@ class FitReport:
 def calibration_error(probabilities: Floats, came: NDArray[np.bool_]) -> float:
     """Expected calibration error (Naeini et al. 2015) of probabilities, given outcomes of the same shape.
 
-    The distance between mean predicted probability and observed frequency, averaged over bins weighted by their numbers of predictions.
+    Distance of the mean probability from the observed frequency, averaged over bins weighted by their numbers of predictions.
     """
     bins = np.minimum((probabilities.ravel() * BINS).astype(np.int64), BINS - 1)
     predicted = np.bincount(bins, weights=probabilities.ravel(), minlength=BINS)

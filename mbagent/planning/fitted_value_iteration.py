@@ -2,7 +2,8 @@
 
 States are sampled from simulated play, which is random at first, then greedy with respect to the values fitted so far, except for
 a share of random actions. Backups through the model's successors alternate with kernel ridge regression (Gordon 1995; for sums of
-functions of few factors, Guestrin, Koller, Parr and Venkataraman 2003). The values apply to one reward function and are dropped with it.
+functions of few factors, Guestrin, Koller, Parr and Venkataraman 2003). The values apply to one reward function and are dropped
+with it.
 """
 
 from __future__ import annotations

@@ -138,11 +138,10 @@ def back_up_mean(
     spans: Floats,
     extremes: Floats,
 ) -> None:
-    """Running means of the simulated returns, in which the initial value counts as ``prior_visits`` returns: UCT (Kocsis and
-    Szepesvari 2006).
+    """Running means of the simulated returns: UCT (Kocsis and Szepesvari 2006).
 
-    Arguments that ``back_up_max`` does not have: ``prior_visits``; ``end_values`` [R, W], value of the node at which a simulation ended;
-    ``counted`` [N, A], number of averaged returns; ``extremes`` [R, 2], lowest and highest return, from which ``spans`` [R]
+    The initial value counts as ``prior_visits`` returns. Arguments that ``back_up_max`` does not have: ``prior_visits``;
+    ``end_values`` [R, W], value of the node at which a simulation ended; ``counted`` [N, A], number of averaged returns; ``extremes`` [R, 2], lowest and highest return, from which ``spans`` [R]
     are computed. ``counted``, ``q``, ``spans`` and ``extremes`` are updated in place.
     """
     n_roots, n_simulations, _ = edges.shape
