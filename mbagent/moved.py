@@ -94,6 +94,17 @@ MOVED = {
 """Old module path: the paths where its names are now."""
 
 
+_RENAMED = {
+    "MachinePlanner": "ValueIterationPlanner",
+    "TableModel": "TabularMDP",
+    "KnownModel": "ExactModel",
+    "GivenReward": "CallableReward",
+    "GoalBook": "RewardSelector",
+    "Goal": "Reward",
+}
+"""Names of classes at the old paths, and their present ones."""
+
+
 class _OldPaths(MetaPathFinder, Loader):
     """Finds the old paths, and only those: it comes after all other finders."""
 
@@ -111,8 +122,9 @@ class _OldPaths(MetaPathFinder, Loader):
         def find(name: str) -> Any:
             for place in () if name.startswith("__") else places:
                 found = importlib.import_module(place)
-                if hasattr(found, name):
-                    return getattr(found, name)
+                for present in (name, _RENAMED.get(name, name)):
+                    if hasattr(found, present):
+                        return getattr(found, present)
             raise AttributeError(f"{module.__name__} has moved to {' and '.join(places)}, and has no {name!r} there.")
 
         vars(module)["__getattr__"] = find

@@ -18,29 +18,25 @@ import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import torch
-import tyro
-from rich.console import Console
-from rich.table import Table
 
-from mbagent import files
-from mbagent.analysis.folders import check_run, open_folder, write_csv
-from mbagent.analysis.planning_benchmark.crowds import WORLDS, compare_values
-from mbagent.analysis.planning_benchmark.latency import SETTINGS, steady
-from mbagent.analysis.planning_benchmark.latency import measure as measure_latency
-from mbagent.analysis.planning_benchmark.network_search import EFFORTS, measure_own, ratios, rows_of_mctx
-from mbagent.analysis.planning_benchmark.networks import build_task, pruned, run_networks_in_mctx
-from mbagent.analysis.planning_benchmark.noise import Sampler, trained
-from mbagent.analysis.planning_benchmark.page import TITLES, shown, write_page
-from mbagent.analysis.planning_benchmark.peers import PeerError
-from mbagent.analysis.planning_benchmark.quality import TOY_TEXT, play_game, play_table, scales, summary
-from mbagent.analysis.planning_benchmark.regret import Settings, compare
-from mbagent.analysis.planning_benchmark.sampling import compare_short_cut, compare_with_naive
-from mbagent.analysis.planning_benchmark.start import GAMES, first_decisions
+from harness import Row, Run, Tables, check_known, run_command
+from studies.planning.coupled import compare_values
+from studies.planning.latency import SETTINGS, steady
+from studies.planning.latency import measure as measure_latency
+from studies.planning.network_search import EFFORTS, measure_own, ratios, rows_of_mctx
+from studies.planning.networks import build_task, pruned, run_networks_in_mctx
+from studies.planning.page import TITLES, shown, write_page
+from studies.planning.peers import PeerError
+from studies.planning.quality import TOY_TEXT, play_game, play_table, scales, summary
+from studies.planning.regret import Settings, compare
+from studies.planning.sampling import compare_short_cut, compare_with_naive
+from studies.planning.start import GAMES, first_decisions
+from worlds.coupled import COUPLED
+from worlds.synthetic_dbn import Sampler, trained
 
-Rows = list[dict[str, Any]]
 Say = Callable[[str], None]
 PRUNED = 0.9
 """Share of the connections that the pruned networks have lost at least."""
@@ -75,7 +71,7 @@ class Args:
     """Folder for the tables and report.html; results of an earlier run there are moved to a folder of their own inside it."""
 
 
-def measure_quality(args: Args, say: Say) -> dict[str, Rows]:
+def measure_quality(args: Args, say: Say) -> Tables:
     """Play with true models and, with ``--full``, with learned ones, against the best there is."""
     seeds, rows = range(args.first_seed + 1000, args.first_seed + 1000 + (5 if args.full else 1)), []
     for name in TOY_TEXT:
@@ -87,17 +83,17 @@ def measure_quality(args: Args, say: Say) -> dict[str, Rows]:
     return {"quality": rows}
 
 
-def measure_crowds(args: Args, say: Say) -> dict[str, Rows]:
+def measure_crowds(args: Args, say: Say) -> Tables:
     """Planning among many noisy variables, without and with values learned in imagination."""
-    rows: Rows = []
-    for make in WORLDS:
+    rows: list[Row] = []
+    for make in COUPLED:
         world = make()
         say(f"crowds: {world.name}")
         rows += compare_values(world, args.first_seed + 1000)
     return {"crowds": rows}
 
 
-def measure_decisions(args: Args, say: Say) -> dict[str, Rows]:
+def measure_decisions(args: Args, say: Say) -> Tables:
     """Milliseconds of a decision beside PPO's."""
     found, rows = scales(say), []
     for setting in SETTINGS:
@@ -106,16 +102,16 @@ def measure_decisions(args: Args, say: Say) -> dict[str, Rows]:
     return {"decisions": rows}
 
 
-def measure_start(args: Args, say: Say) -> dict[str, Rows]:
+def measure_start(args: Args, say: Say) -> Tables:
     """The first decision of a new process."""
-    rows: Rows = []
+    rows: list[Row] = []
     for key in GAMES:
         say(f"start: {key}")
         rows += first_decisions(key, args.first_seed + 1000)
     return {"start": rows}
 
 
-def measure_memory(args: Args, say: Say) -> dict[str, Rows]:
+def measure_memory(args: Args, say: Say) -> Tables:
     """Memory over many decisions."""
     rows = []
     for setting in SETTINGS[2:]:
@@ -124,16 +120,16 @@ def measure_memory(args: Args, say: Say) -> dict[str, Rows]:
     return {"memory": rows}
 
 
-def measure_regret(args: Args, say: Say) -> dict[str, Rows]:
+def measure_regret(args: Args, say: Say) -> Tables:
     """Regret and speed of searches on tables."""
     settings = Settings(args.worlds, args.roots, args.seeds, args.first_seed, args.budgets, args.peers_python)
     regrets, speeds = compare(settings, say=say)
     return {"regret": [asdict(row) for row in regrets], "speed": [asdict(row) for row in speeds]}
 
 
-def measure_naive(args: Args, say: Say) -> dict[str, Rows]:
+def measure_naive(args: Args, say: Say) -> Tables:
     """The compiled samplers beside the naive procedure."""
-    rows: Rows = []
+    rows: list[Row] = []
     for sampler in get_args(Sampler):
         say(f"naive: {sampler}")
         model = trained(sampler, 32, args.first_seed)
@@ -141,9 +137,9 @@ def measure_naive(args: Args, say: Say) -> dict[str, Rows]:
     return {"naive": rows}
 
 
-def measure_short_cut(args: Args, say: Say) -> dict[str, Rows]:
+def measure_short_cut(args: Args, say: Say) -> Tables:
     """Sweeps over what is uncertain beside sweeps over everything."""
-    rows: Rows = []
+    rows: list[Row] = []
     for d in (32, 128):
         say(f"short cut: {d} bits")
         model = trained("sweeps", d, args.first_seed)
@@ -151,7 +147,7 @@ def measure_short_cut(args: Args, say: Say) -> dict[str, Rows]:
     return {"short cut": rows}
 
 
-def measure_networks(args: Args, say: Say) -> dict[str, Rows]:
+def measure_networks(args: Args, say: Say) -> Tables:
     """Searches through learned networks, whole and pruned."""
     say("networks: learning the game")
     task = build_task(args.first_seed)
@@ -176,7 +172,7 @@ def measure_networks(args: Args, say: Say) -> dict[str, Rows]:
     }
 
 
-_MEASURES: dict[str, Callable[[Args, Say], dict[str, Rows]]] = {
+_MEASURES: dict[str, Callable[[Args, Say], Tables]] = {
     "quality": measure_quality,
     "crowds": measure_crowds,
     "decisions": measure_decisions,
@@ -189,52 +185,34 @@ _MEASURES: dict[str, Callable[[Args, Say], dict[str, Rows]]] = {
 }
 
 
-def check(args: Args) -> None:
-    """Refuses options that nothing can be measured with.
+def check(args: Args, run: Run | None = None) -> tuple[str, ...]:
+    """The parts to measure.
 
     Raises:
-        ValueError: one of them.
+        ValueError: nothing can be measured with these options.
     """
-    check_run(args.output)
-    for part in args.parts:
-        if part not in PARTS:
-            raise ValueError(f"There is no part {part!r}; choose from {', '.join(PARTS)}.")
+    check_known("part", args.parts, PARTS)
     if min(args.worlds, args.roots, args.seeds, *args.budgets) < 1:
         raise ValueError("All numbers must be at least 1.")
+    return args.parts
+
+
+def execute(args: Args, parts: tuple[str, ...], run: Run) -> None:
+    """Measures one part after another, all in this process: they are timed."""
+    torch.set_num_threads(1)
+    tables: Tables = {}
+    for part in parts:
+        tables |= {name: rows for name, rows in _MEASURES[part](args, run.say).items() if rows}
+        run.write(tables)
+    run.write_pictures(write_page(args.output / "report.html", tables, run.command))
+    for name, rows in tables.items():
+        run.show(TITLES[name], rows[0], [[shown(value) for value in row.values()] for row in rows], width=140)
+    run.say(f"Wrote report.html and the tables to {args.output}.")
 
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command line and returns its exit code."""
-    args = tyro.cli(Args, args=argv, description=__doc__.splitlines()[0])
-    console = Console()
-
-    def say(text: str) -> None:
-        console.print(text, highlight=False, markup=False, soft_wrap=True)
-
-    try:
-        check(args)
-    except ValueError as error:
-        console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
-        return 1
-    torch.set_num_threads(1)
-    open_folder(args.output, console)
-    tables: dict[str, Rows] = {}
-    for part in args.parts:
-        for name, rows in _MEASURES[part](args, say).items():
-            if rows:
-                tables[name] = rows
-                write_csv(args.output / f"{name.replace(' ', '_')}.csv", rows)
-    options = sys.argv[1:] if argv is None else argv
-    pictures = write_page(args.output / "report.html", tables, " ".join(["scripts/benchmark_planner.py", *options]))
-    for name, png in pictures.items():
-        files.write(args.output / f"{name}.png", png)
-    for name, rows in tables.items():
-        table = Table(*rows[0], title=TITLES[name])
-        for row in rows:
-            table.add_row(*(shown(value) for value in row.values()))
-        Console(width=max(console.width, 140)).print(table)
-    say(f"Wrote report.html and the tables to {args.output}.")
-    return 0
+    return run_command("benchmark_planner", __doc__, Args, check, execute, argv)
 
 
 if __name__ == "__main__":

@@ -19,16 +19,15 @@ import sys
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
-import tyro
-from rich.console import Console
-
-from mbagent.analysis.cases import CASES, find_case
-from mbagent.analysis.comparison import BASELINES, FULL, QUICK, Settings, load, run
-from mbagent.analysis.report import write_report
-from mbagent.analysis.runner import JobsFailedError
-from mbagent.analysis.summary import save_csv, summarise
+from harness import Run, check_known, run_command
+from studies.comparison.page import write_report
+from studies.comparison.plan import BASELINES, FULL, QUICK, Settings, load
+from studies.comparison.plan import run as run_comparison
+from studies.comparison.records import Record
+from studies.comparison.summary import save_csv, summarise
+from worlds.games import CASES, find_case
 
 
 @dataclass(frozen=True)
@@ -73,41 +72,43 @@ def settings_of(args: Args) -> Settings:
     chosen = FULL if args.full else QUICK
     given: dict[str, Any] = {name: getattr(args, name) for name in _OVERRIDES}
     chosen = replace(chosen, **{name: value for name, value in given.items() if value is not None})
-    unknown = [name for name in args.baselines if name not in BASELINES]
-    if unknown:
-        raise ValueError(f"There is no baseline {unknown[0]!r}; choose from {', '.join(BASELINES)}.")
+    check_known("baseline", args.baselines, BASELINES)
     cases = tuple(find_case(key).key for key in args.cases)
     curve_steps = tuple(s for s in chosen.curve_steps if s < chosen.steps and args.curves)
     return replace(chosen, cases=cases, curve_steps=curve_steps)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Runs the command line and returns its exit code."""
-    args = tyro.cli(Args, args=argv, description=__doc__.splitlines()[0])
-    console = Console()
-    try:
-        settings = settings_of(args)
-        start = time.perf_counter()
-        if args.report_only:
-            settings, records = load(args.output)
-        else:
-            records = run(settings, args.output, workers=args.workers, console=console, resume=args.resume)
-    except (ValueError, JobsFailedError) as error:
-        console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
-        return 1
-    console.print("Summing up and drawing ...")
+Records: TypeAlias = tuple[Settings, list[Record], float]
+"""The settings of a comparison, its records, and the minutes it took."""
+
+
+def prepare(args: Args, run: Run) -> Records:
+    """The records of a new comparison, or of the last one in the folder.
+
+    Raises:
+        ValueError: an option is out of range, or there are no records.
+        CellsFailedError: jobs failed.
+    """
+    settings, start = settings_of(args), time.perf_counter()
+    if args.report_only:
+        return *load(args.output), 0.0
+    records = run_comparison(settings, args.output, workers=args.workers, console=run.console, resume=args.resume)
+    return settings, records, (time.perf_counter() - start) / 60
+
+
+def execute(args: Args, found: Records, run: Run) -> None:
+    """Sums up and draws."""
+    settings, records, minutes = found
+    run.say("Summing up and drawing ...")
     results = summarise(records, settings)
     save_csv(args.output / "results.csv", records, results)
-    given = sys.argv[1:] if argv is None else argv
-    write_report(
-        args.output / "report.html",
-        results,
-        settings,
-        command=" ".join(["python scripts/compare_agents.py", *given]),
-        minutes=(time.perf_counter() - start) / 60,
-    )
-    console.print(f"Wrote {args.output / 'report.html'} and {args.output / 'results.csv'}.")
-    return 0
+    write_report(args.output / "report.html", results, settings, command=run.command, minutes=minutes)
+    run.say(f"Wrote {args.output / 'report.html'} and {args.output / 'results.csv'}.")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command line and returns its exit code."""
+    return run_command("compare_agents", __doc__, Args, prepare, execute, argv, opens=False)
 
 
 if __name__ == "__main__":

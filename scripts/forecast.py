@@ -12,19 +12,13 @@ import os
 # Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import shlex
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import tyro
-from rich.console import Console
-
-from mbagent import files
-from mbagent.analysis.folders import check_run, open_folder
-from mbagent.analysis.forecasts.experiment import CASES, Outcome, Return, Score, Settings, plan, run_task, save_csv
-from mbagent.analysis.forecasts.page import write_page
-from mbagent.analysis.parallel import run_all
+from harness import Run, joined, run_cells, run_command
+from studies.forecasting.experiment import CASES, Settings, cells, run_cell
+from studies.forecasting.page import write_page
 
 QUICK_STEPS, FULL_STEPS = (1, 2, 4, 8, 15), tuple(range(1, 16))
 
@@ -57,7 +51,7 @@ class Args:
     """Number of processes, each with one thread."""
 
 
-def settings_of(args: Args) -> Settings:
+def settings_of(args: Args, run: Run | None = None) -> Settings:
     """The settings that the options stand for."""
 
     def chosen(given: int | None, quick: int, full: int) -> int:
@@ -76,31 +70,16 @@ def settings_of(args: Args) -> Settings:
     )
 
 
-def _line(outcome: Outcome) -> str:
-    return f"{outcome.task.case.name}, seed {outcome.task.seed}"
+def execute(args: Args, settings: Settings, run: Run) -> None:
+    """Learns and forecasts, and writes the page."""
+    tables = joined(run_cells(run_cell, cells(settings), run))
+    run.write_pictures({"forecast": write_page(args.output / "report.html", tables, settings, run.command)})
+    run.say(f"Wrote report.html, forecast.png and results.csv to {args.output}.")
 
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command line and returns its exit code."""
-    args = tyro.cli(Args, args=argv, description=__doc__.splitlines()[0])
-    console = Console()
-    try:
-        settings = settings_of(args)
-        check_run(args.output, args.workers)
-    except ValueError as error:
-        console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
-        return 1
-    open_folder(args.output, console)
-    outcomes: list[Outcome] = []
-    command = shlex.join(["python", "scripts/forecast.py", *(sys.argv[1:] if argv is None else argv)])
-    for outcome in run_all(run_task, plan(settings), workers=args.workers, console=console, name=_line):
-        outcomes.append(outcome)
-        save_csv(args.output / "results.csv", [score for o in outcomes for score in o.scores], Score)
-        save_csv(args.output / "returns.csv", [value for o in outcomes for value in o.returns], Return)
-    figure = write_page(args.output / "report.html", outcomes, settings, command)
-    files.write(args.output / "forecast.png", figure)
-    console.print(f"Wrote report.html, forecast.png and results.csv to {args.output}.")
-    return 0
+    return run_command("forecast", __doc__, Args, settings_of, execute, argv)
 
 
 if __name__ == "__main__":

@@ -18,16 +18,9 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-import tyro
-from rich.console import Console
-from rich.table import Table
-
-from mbagent import files
-from mbagent.analysis.external.curves import PLAYERS, Course, Row, draw_curves, run_course
-from mbagent.analysis.external.worlds import find_world
-from mbagent.analysis.folders import check_run, open_folder, write_csv
-from mbagent.analysis.parallel import run_all
+from harness import Run, check_known, run_cells, run_command
+from studies.learning.curves import PLAYERS, Cell, draw_curves, run_cell, show
+from worlds.registry import find_world
 
 QUICK, FULL = (1000, 5000), (10_000, 30_000, 100_000)
 
@@ -54,15 +47,13 @@ class Args:
     """Number of processes, each with one thread."""
 
 
-def plan(args: Args) -> list[Course]:
+def cells(args: Args, run: Run | None = None) -> list[Cell]:
     """All that is to be done.
 
     Raises:
         ValueError: there is no such world or agent, a world needs an extra, or a number is out of range.
     """
-    unknown = [agent for agent in args.agents if agent not in PLAYERS]
-    if unknown:
-        raise ValueError(f"There is no agent {unknown[0]!r}; choose from {', '.join(map(repr, PLAYERS))}.")
+    check_known("agent", args.agents, PLAYERS)
     marks = args.marks or (FULL if args.full else QUICK)
     episodes = args.episodes if args.episodes is not None else 20 if args.full else 5
     if min(args.seeds, episodes, *marks) < 1 or list(marks) != sorted(set(marks)):
@@ -72,45 +63,20 @@ def plan(args: Args) -> list[Course]:
     for world in worlds:
         if world.missing:
             raise ValueError(f'{world.name} needs pip install "mbagent[{world.missing}]".')
-    return [
-        Course(world, agent, seed, marks, episodes) for seed in range(args.seeds) for agent in args.agents for world in worlds
-    ]
+    return [Cell(world, agent, seed, marks, episodes) for seed in range(args.seeds) for agent in args.agents for world in worlds]
 
 
-def show(rows: list[Row], console: Console) -> None:
-    """Prints means over seeds."""
-    table = Table("world", "agent", "steps", "return", "standard error", "learning, s", title="Learning curves")
-    for key in sorted({(row["world"], row["agent"], row["steps"]) for row in rows}):
-        own = [row for row in rows if (row["world"], row["agent"], row["steps"]) == key]
-        value, error, seconds = (float(np.mean([row[name] for row in own])) for name in ("return", "error", "learn_seconds"))
-        table.add_row(key[0], key[1], f"{key[2]:,}", f"{value:.2f}", f"{error:.2f}", f"{seconds:.0f}")
-    console.print(table)
+def execute(args: Args, todo: list[Cell], run: Run) -> None:
+    """Learns and plays, draws the curves and prints the means."""
+    rows = [row for result in run_cells(run_cell, todo, run) for row in result.rows]
+    run.write_pictures({"curves": draw_curves(rows)})
+    show(rows, run)
+    run.say(f"Wrote curves.csv and curves.png to {args.output}.")
 
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command line and returns its exit code."""
-    args = tyro.cli(Args, args=argv, description=__doc__.splitlines()[0])
-    console = Console()
-    try:
-        check_run(args.output, args.workers)
-        courses = plan(args)
-    except ValueError as error:
-        console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
-        return 1
-    open_folder(args.output, console)
-    rows: list[Row] = []
-
-    def line(result: list[Row]) -> str:
-        last = result[-1]
-        return f"{last['world']}, {last['agent']}, seed {last['seed']}: {last['return']:.2f} after {last['steps']:,} steps"
-
-    for result in run_all(run_course, courses, workers=args.workers, console=console, name=line):
-        rows += result
-        write_csv(args.output / "curves.csv", rows)
-    files.write(args.output / "curves.png", draw_curves(rows))
-    show(rows, console)
-    console.print(f"Wrote curves.csv and curves.png to {args.output}.", highlight=False, soft_wrap=True)
-    return 0
+    return run_command("learning_curves", __doc__, Args, cells, execute, argv)
 
 
 if __name__ == "__main__":

@@ -14,24 +14,17 @@ import os
 # Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import importlib.util
 import sys
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TypeAlias
 
-import torch
-import tyro
-from rich.console import Console
-from rich.table import Table
+from harness import Row, Run, joined, run_cells, run_command
+from studies.model_accuracy.experiment import CASES, Cell, Settings, cells, means, run_cell
+from studies.model_accuracy.page import averaged, shown, write_page
+from studies.model_accuracy.studies import STUDIES, Question, answer, questions
 
-from mbagent import files
-from mbagent.analysis.folders import check_run, open_folder, write_csv
-from mbagent.analysis.model_accuracy.experiment import CASES, Outcome, Score, Settings, means, plan, run_task
-from mbagent.analysis.model_accuracy.page import averaged, shown, write_page
-from mbagent.analysis.model_accuracy.studies import STUDIES, Study, parts
-from mbagent.analysis.parallel import run_all
+Plan: TypeAlias = tuple[list[Cell], list[Question]]
 
 
 @dataclass(frozen=True)
@@ -61,10 +54,13 @@ class Args:
     """Number of processes, each with one thread."""
 
 
-def settings_of(args: Args) -> Settings:
-    """The settings that the options stand for."""
-    check_run(args.output, args.workers)
-    return Settings(
+def plan(args: Args, run: Run | None = None) -> Plan:
+    """What is to be measured, and the further questions.
+
+    Raises:
+        ValueError: an option is out of range.
+    """
+    settings = Settings(
         cases=args.cases,
         models=args.models,
         steps=args.steps if args.steps is not None else (2000, 5000, 20_000) if args.full else (2000, 5000),
@@ -72,12 +68,14 @@ def settings_of(args: Args) -> Settings:
         first_seed=args.first_seed,
         n_tests=args.n_tests if args.n_tests is not None else 100_000 if args.full else 20_000,
     )
+    seeds = range(args.first_seed, args.first_seed + settings.seeds)
+    return cells(settings) if args.cases else [], questions(args.studies, seeds, args.full)
 
 
-def show(scores: list[Score], console: Console) -> None:
+def show(scores: list[Row], run: Run) -> None:
     """Prints means over seeds."""
     names = ("world", "model", "steps", "likeliest", "sampled", "joint TV", "log-likelihood", "fit, s", "draw, µs")
-    table = Table(*names, title="Exact next states on new random play")
+    lines = []
     for (case, model, steps), m in sorted(means(scores).items()):
         figures = [f"{100 * m[name]:.2f}%" for name in ("likeliest", "sampled")]
         figures += [
@@ -86,89 +84,29 @@ def show(scores: list[Score], console: Console) -> None:
             f"{m['fit_seconds']:.1f}",
             f"{m['sample_microseconds']:.1f}",
         ]
-        table.add_row(case, model, f"{steps:,}", *("–" if "nan" in figure else figure for figure in figures))
-    Console(width=max(console.width, 120)).print(table)
+        lines.append([case, model, f"{steps:,}", *("–" if "nan" in figure else figure for figure in figures)])
+    run.show("Exact next states on new random play", names, lines, width=120)
 
 
-@dataclass(frozen=True)
-class Question:
-    """One study, or a part of it, with one seed."""
-
-    study: str
-    work: Study
-    seed: int
-    full: bool
-
-
-def answer(question: Question) -> tuple[Question, list[dict[str, Any]]]:
-    """Runs a study."""
-    torch.set_num_threads(1)
-    return question, question.work(question.seed, question.full)
-
-
-def check_studies(names: Sequence[str]) -> None:
-    """Refuses unknown studies, and those whose packages are missing.
-
-    Raises:
-        ValueError: there is one.
-    """
-    for name in names:
-        if name not in STUDIES:
-            raise ValueError(f"There is no study {name!r}; choose from {', '.join(STUDIES)}.")
-    if "minatar" in names and importlib.util.find_spec("minatar") is None:
-        raise ValueError('The study minatar needs MinAtar: pip install "mbagent[minatar]".')
-
-
-def show_rows(study: str, rows: list[dict[str, Any]], console: Console) -> None:
-    """Prints a study's means over seeds."""
-    table = Table(*rows[0], title=(STUDIES[study].__doc__ or "").splitlines()[0])
-    for row in rows:
-        table.add_row(*(shown(value) for value in row.values()))
-    Console(width=max(console.width, 120)).print(table)
+def execute(args: Args, plan: Plan, run: Run) -> None:
+    """Measures, asks, and writes the page."""
+    todo, further = plan
+    scores = [row for result in run_cells(run_cell, todo, run) for row in result.rows]
+    if scores:
+        show(scores, run)
+    rows = joined(run_cells(answer, further, run))
+    accuracy = [{"world": c, "model": m, "steps": n, **figures} for (c, m, n), figures in sorted(means(scores).items())]
+    run.write_pictures(write_page(args.output / "report.html", rows, accuracy, run.command))
+    for study, found in rows.items():
+        lines = averaged(study, found)
+        title = (STUDIES[study].__doc__ or "").splitlines()[0]
+        run.show(title, lines[0], [[shown(value) for value in line.values()] for line in lines], width=120)
+    run.say(f"Wrote report.html and the tables to {args.output}.")
 
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command line and returns its exit code."""
-    args = tyro.cli(Args, args=argv, description=__doc__.splitlines()[0])
-    console = Console()
-    try:
-        settings = settings_of(args)
-        tasks = plan(settings) if args.cases else []
-        check_studies(args.studies)
-    except ValueError as error:
-        console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
-        return 1
-    open_folder(args.output, console)
-    scores: list[Score] = []
-    rows: dict[str, list[dict[str, Any]]] = {}
-
-    def line(outcome: Outcome) -> str:
-        return f"{outcome.task.case.name}, {outcome.task.steps} steps, seed {outcome.task.seed}"
-
-    for outcome in run_all(run_task, tasks, workers=args.workers, console=console, name=line):
-        scores += outcome.scores
-        write_csv(args.output / "results.csv", [asdict(score) for score in scores])
-    if scores:
-        show(scores, console)
-    questions = [
-        Question(name, work, args.first_seed + i, args.full)
-        for name in args.studies
-        for i in range(settings.seeds)
-        for work in parts(name, args.full)
-    ]
-    for question, found in run_all(
-        answer, questions, workers=args.workers, console=console, name=lambda done: f"{done[0].study}, seed {done[0].seed}"
-    ):
-        rows.setdefault(question.study, []).extend(found)
-        write_csv(args.output / f"{question.study}.csv", rows[question.study])
-    accuracy = [{"world": c, "model": m, "steps": n, **figures} for (c, m, n), figures in sorted(means(scores).items())]
-    pictures = write_page(args.output / "report.html", rows, accuracy, "scripts/model_accuracy.py" + " --full" * args.full)
-    for name, png in pictures.items():
-        files.write(args.output / f"{name}.png", png)
-    for study, found in rows.items():
-        show_rows(study, averaged(study, found), console)
-    console.print(f"Wrote report.html and the tables to {args.output}.", highlight=False, soft_wrap=True)
-    return 0
+    return run_command("model_accuracy", __doc__, Args, plan, execute, argv)
 
 
 if __name__ == "__main__":

@@ -12,20 +12,14 @@ import os
 # Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import shlex
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
-from rich.console import Console
-
-from mbagent import files
-from mbagent.analysis.folders import check_run, open_folder, write_csv
-from mbagent.analysis.parallel import run_all
-from mbagent.analysis.pruning.experiment import FRACTIONS, GAMES, Networks, Outcome, Settings, Way, plan, run_task
-from mbagent.analysis.pruning.measures import measure_size
-from mbagent.analysis.pruning.page import summary_rows, write_page
+from harness import Result, Run, run_cells, run_command
+from studies.pruning.experiment import FRACTIONS, GAMES, Cell, Networks, Settings, Way, cells, run_cell
+from studies.pruning.measures import measure_size
+from studies.pruning.page import summary_rows, write_page
 
 SIZES = (16, 32, 64, 128)
 """Numbers of variables."""
@@ -61,7 +55,7 @@ class Args:
     """Number of processes, each with one thread; speeds are measured best with one."""
 
 
-def settings_of(args: Args) -> Settings:
+def settings_of(args: Args, run: Run | None = None) -> Settings:
     """The settings that the options stand for."""
     return Settings(
         games=args.games if args.games is not None else GAMES if args.full else GAMES[:1],
@@ -75,34 +69,24 @@ def settings_of(args: Args) -> Settings:
     )
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Runs the command line and returns its exit code."""
-    args = tyro.cli(Args, args=argv, description=__doc__.splitlines()[0])
-    console = Console()
-    try:
-        settings = settings_of(args)
-        check_run(args.output, args.workers)
-    except ValueError as error:
-        console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
-        return 1
-    open_folder(args.output, console)
+def execute(args: Args, settings: Settings, run: Run) -> None:
+    """Prunes and measures; the page is written anew after each cell."""
     sizes = args.sizes if args.sizes is not None else SIZES if args.full else ()
     costs = [measure_size(d, settings.first_seed + i) for d in sizes for i in range(min(settings.seeds, 3))]
-    if costs:
-        write_csv(args.output / "sizes.csv", [row._asdict() for row in costs])
-    outcomes: list[Outcome] = []
-    command = shlex.join(["python", "scripts/pruning.py", *(sys.argv[1:] if argv is None else argv)])
-    work = run_all(
-        run_task, plan(settings), workers=args.workers, console=console, name=lambda o: f"{o.task.game}, seed {o.task.seed}"
-    )
-    for outcome in work:
-        outcomes.append(outcome)
-        write_csv(args.output / "results.csv", [asdict(row) for o in outcomes for row in o.rows])
-        write_csv(args.output / "summary.csv", summary_rows(outcomes))
-        for name, png in write_page(args.output / "report.html", outcomes, settings, command, costs).items():
-            files.write(args.output / f"{name}.png", png)
-    console.print(f"Wrote report.html, results.csv and the figures to {args.output}.")
-    return 0
+    run.write({"sizes": [row._asdict() for row in costs]})
+
+    def write(results: list[Result[Cell]]) -> None:
+        outcomes = [result.arrays["outcome"] for result in results]
+        run.write({"summary": summary_rows(outcomes)})
+        run.write_pictures(write_page(args.output / "report.html", outcomes, settings, run.command, costs))
+
+    run_cells(run_cell, cells(settings), run, each=write)
+    run.say(f"Wrote report.html, results.csv and the figures to {args.output}.")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs the command line and returns its exit code."""
+    return run_command("pruning", __doc__, Args, settings_of, execute, argv)
 
 
 if __name__ == "__main__":

@@ -17,13 +17,14 @@ import tyro
 from rich.console import Console
 
 from mbagent import files
-from mbagent.analysis.accuracy.results import load_scores
-from mbagent.analysis.accuracy.summary import markdown_table
-from mbagent.analysis.cases import CASES
-from mbagent.analysis.external.summary import markdown_table as external_table
-from mbagent.analysis.pruning.page import markdown_table as pruning_table
-from mbagent.analysis.records import AGENT, LEARNED_REWARD, TRUE_MODEL
-from mbagent.analysis.statistics import interquartile_mean
+from mbagent.evaluation.report import Table
+from mbagent.evaluation.statistics import interquartile_mean
+from studies.comparison.records import AGENT, LEARNED_REWARD, TRUE_MODEL
+from studies.external import markdown_table as external_table
+from studies.pruning.page import markdown_table as pruning_table
+from studies.sampling_accuracy.results import load_scores
+from studies.sampling_accuracy.summary import markdown_table
+from worlds.games import CASES
 
 COLUMNS = {"learned model": AGENT, "reward learned too": LEARNED_REWARD, "true model": TRUE_MODEL}
 BASELINES = ("PPO", "DQN", "A2C")
@@ -80,12 +81,12 @@ def new_goals(scores: Scores, case: str) -> str:
 def table(scores: Scores, others: Scores) -> str:
     """The table, as Markdown."""
     names = [*COLUMNS, *BASELINES, "worst new goal"]
-    lines = ["| | " + " | ".join(names) + " |", "| --- |" + " ---: |" * len(names)]
+    lines = []
     for case in CASES:
         cells = [score(scores.get((case.key, agent, "default"), [])) for agent in COLUMNS.values()]
         cells += [score(others.get((case.key, agent, "default"), [])) for agent in BASELINES]
-        lines.append(f"| {case.title} | " + " | ".join([*cells, new_goals(scores, case.key)]) + " |")
-    return "\n".join(lines)
+        lines.append([case.title, *cells, new_goals(scores, case.key)])
+    return Table(["", *names], lines).markdown()
 
 
 def _fill(document: Path, tables: Mapping[str, str]) -> None:

@@ -13,32 +13,26 @@ import os
 # Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import shlex
 import sys
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
-import tyro
-from rich.console import Console
-
-from mbagent.analysis.accuracy.experiment import FIRST_SCORED_SEED, Outcome, Part, Settings, Task, collect, plan, run_task
-from mbagent.analysis.accuracy.page import write_page
-from mbagent.analysis.accuracy.results import (
+from harness import Result, Run, Tables, joined, open_folder, run_cells, run_command
+from studies.sampling_accuracy.experiment import FIRST_SCORED_SEED, TABLES, Cell, Part, Settings, cells, run_cell
+from studies.sampling_accuracy.page import write_page
+from studies.sampling_accuracy.results import (
     Points,
     first_points,
     load_points,
     load_scores,
     load_settings,
     save_points,
-    save_scores,
     save_settings,
 )
-from mbagent.analysis.accuracy.samplers import FitOptions
-from mbagent.analysis.accuracy.scores import Score
-from mbagent.analysis.accuracy.trials import TRIALS
-from mbagent.analysis.folders import check_run, open_folder
-from mbagent.analysis.parallel import run_all
+from studies.sampling_accuracy.samplers import FitOptions
+from studies.sampling_accuracy.scores import Score
+from studies.sampling_accuracy.trials import TRIALS
 
 QUICK_TRIALS = tuple(trial.name for trial in TRIALS if trial.options.d <= 8)
 
@@ -86,64 +80,66 @@ def settings_of(args: Args) -> Settings:
     return Settings(trials, seeds, args.first_seed, args.n_draws, args.fit, args.relates, args.shuffle, args.multiplier, parts)
 
 
-def prepare(args: Args, settings: Settings, console: Console) -> Settings:
-    """Makes the folder ready for a run, or for what is left of one; returns the settings that its figures have.
+class Plan(NamedTuple):
+    """What is left to be done, and what an earlier run has left.
+
+    Attributes:
+        settings: those that all figures have.
+        todo: cells that are not done.
+        kept: rows of an earlier run.
+        points: pairs of an earlier run.
+    """
+
+    settings: Settings
+    todo: list[Cell]
+    kept: Tables
+    points: Points
+
+
+def prepare(args: Args, run: Run) -> Plan:
+    """Makes the folder ready for a run, or for what is left of one.
 
     Raises:
         ValueError: there is nothing to go on with, or it was measured with other options.
     """
-    check_run(args.output, args.workers)
-    kept = args.output / "settings.json"
+    settings, noted = settings_of(args), args.output / "settings.json"
     if args.report_only:
-        return load_settings(kept)
-    args.output.mkdir(parents=True, exist_ok=True)
-    if args.resume and kept.exists():
-        if load_settings(kept).measured() != settings.measured():
-            raise ValueError(f"{args.output} was measured with other options ({kept}); give those, or another --output.")
+        settings = load_settings(noted)
     else:
-        open_folder(args.output, console)
-    save_settings(kept, settings)
-    return settings
-
-
-def _line(outcome: Outcome) -> str:
-    return f"{outcome.task.part}, {outcome.task.trial}, data set {outcome.task.seed}"
-
-
-def measure(args: Args, tasks: list[Task], console: Console) -> tuple[dict[Part, list[Score]], Points]:
-    """Does the tasks that are not done, saving after each; returns all scores in the folder, by part, and the points."""
-    tables = {part: args.output / f"{'results' if part == 'samplers' else part}.csv" for part in get_args(Part)}
-    kept = {part: load_scores(path) for part, path in tables.items()}
-    drawn = load_points(args.output / "points.npz")
+        args.output.mkdir(parents=True, exist_ok=True)
+        if args.resume and noted.exists():
+            if load_settings(noted).measured() != settings.measured():
+                raise ValueError(f"{args.output} was measured with other options ({noted}); give those, or another --output.")
+        else:
+            open_folder(args.output, run.console)
+        save_settings(noted, settings)
+    kept = {part: load_scores(args.output / f"{TABLES[part]}.csv") for part in get_args(Part)}
     done = {(part, score.trial, score.seed) for part, scores in kept.items() for score in scores}
-    todo = [task for task in tasks if (task.part, task.trial, task.seed) not in done]
-    outcomes: list[Outcome] = []
-    for outcome in run_all(run_task, todo, workers=args.workers, console=console, name=_line):
-        outcomes.append(outcome)
-        part = outcome.task.part
-        save_scores(tables[part], [*kept[part], *collect(outcomes, part)])
-        if part == "samplers":
-            save_points(args.output / "points.npz", {**first_points(outcomes), **drawn})
-    scores = {part: [*kept[part], *collect(outcomes, part)] for part in kept}
-    return scores, {**first_points(outcomes), **drawn}
+    if args.report_only and not done:
+        raise ValueError(f"There are no results in {args.output}: measure first.")
+    todo = [] if args.report_only else [cell for cell in cells(settings) if (cell.part, cell.trial, cell.seed) not in done]
+    rows = {TABLES[part]: [asdict(score) for score in scores] for part, scores in kept.items()}
+    return Plan(settings, todo, rows, load_points(args.output / "points.npz"))
+
+
+def execute(args: Args, plan: Plan, run: Run) -> None:
+    """Measures what is not done, saving after each cell, and writes the page."""
+
+    def save(results: list[Result[Cell]]) -> None:
+        if results[-1].cell.part == "samplers":
+            save_points(args.output / "points.npz", {**first_points(results), **plan.points})
+
+    results = run_cells(run_cell, plan.todo, run, kept=plan.kept, order=lambda cell: cell.place, each=save)
+    tables = joined(sorted(results, key=lambda result: result.cell.place), plan.kept)
+    scores = {part: [Score(**row) for row in tables[name]] for part, name in TABLES.items()}
+    points = {**first_points(results), **plan.points}
+    write_page(args.output / "report.html", scores, points, plan.settings, run.command)
+    run.say(f"Wrote report.html and the figures behind it to {args.output}.")
 
 
 def main(argv: list[str] | None = None) -> int:
     """Runs the command line and returns its exit code."""
-    args = tyro.cli(Args, args=argv, description=__doc__.splitlines()[0])
-    console = Console()
-    try:
-        settings = prepare(args, settings_of(args), console)
-        scores, points = measure(args, [] if args.report_only else plan(settings), console)
-        if not any(scores.values()):
-            raise ValueError(f"There are no results in {args.output}: measure first.")
-    except ValueError as error:
-        console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
-        return 1
-    command = shlex.join(["python", "scripts/sampling_accuracy.py", *(sys.argv[1:] if argv is None else argv)])
-    write_page(args.output / "report.html", scores, points, settings, command)
-    console.print(f"Wrote report.html and the figures behind it to {args.output}.", highlight=False, soft_wrap=True)
-    return 0
+    return run_command("sampling_accuracy", __doc__, Args, prepare, execute, argv, opens=False)
 
 
 if __name__ == "__main__":

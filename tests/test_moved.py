@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 import mbagent
+from mbagent.models.tabular import TabularMDP
 from mbagent.moved import MOVED
 
 
@@ -34,6 +35,7 @@ def test_an_old_path_leads_to_the_new_one(old: str, monkeypatch: pytest.MonkeyPa
 
 def test_names_come_from_old_paths(monkeypatch: pytest.MonkeyPatch) -> None:
     assert imported("mbagent.transitions", monkeypatch).TransitionDataset is mbagent.TransitionDataset
+    assert imported("mbagent.models.table", monkeypatch).TableModel is TabularMDP
 
 
 def test_other_paths_are_not_found() -> None:

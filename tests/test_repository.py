@@ -1,6 +1,10 @@
-"""Habits of the whole repository that no linter rule covers."""
+"""Rules for the whole repository that no linter rule covers."""
 
 import ast
+import statistics
+import tokenize
+from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,6 +13,51 @@ ROOT = Path(__file__).parents[1]
 SOURCES = sorted(p for folder in ("mbagent", "envs", "scripts", "tests") for p in (ROOT / folder).rglob("*.py"))
 MAX_FILE_LINES = 600
 MAX_FUNCTION_LINES = 60
+MEDIAN_FUNCTION_LINES = 10
+LIBRARY = [p for p in SOURCES if p.relative_to(ROOT).parts[0] == "mbagent"]
+FORMER_NAMES = {
+    *(
+        "Acts",
+        "Asking",
+        "Foresight",
+        "GivenReward",
+        "GoalBook",
+        "Habit",
+        "Head",
+        "Imagined",
+        "LAWLESS",
+        "Laws",
+        "Lean",
+        "Machine",
+    ),
+    *("MachinePlanner", "Manner", "Partner", "Seen", "Steered", "View", "Way", "acts_of", "ask_in", "begin_wave", "best_askings"),
+    *(
+        "couple",
+        "coupled_layout",
+        "coupling",
+        "coupling_of",
+        "couplings",
+        "end_wave",
+        "find_couplings",
+        "find_laws",
+        "find_steered",
+    ),
+    *(
+        "flag_events",
+        "foresee",
+        "foresight",
+        "foretell",
+        "foretold",
+        "habit",
+        "habit_of",
+        "hangs_on_action",
+        "has_event",
+        "is_late",
+    ),
+    *("laws", "lean", "luck", "manner", "manners", "meeting", "meetings", "nothing_late", "novelty", "partner", "partners"),
+    *("rehearse", "still_true_since", "told_by", "typical", "zoom"),
+}
+"""Names that were replaced by standard terms, see docs/glossary.md."""
 
 
 def lines_without_docstring(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
@@ -38,9 +87,11 @@ def test_files_and_functions_stay_short(path: Path) -> None:
     ("folder", "forbidden"),
     [
         ("envs", ("mbagent",)),
-        ("mbagent/models", ("mbagent.planning", "mbagent.agent", "mbagent.analysis")),
-        ("mbagent/planning", ("mbagent.agent", "mbagent.analysis")),
-        ("mbagent/adapters", ("mbagent.models", "mbagent.planning", "mbagent.agent", "mbagent.analysis")),
+        ("mbagent", ("exact", "harness", "peers", "scripts", "studies", "worlds")),
+        ("mbagent/models", ("mbagent.planning", "mbagent.agent", "mbagent.evaluation")),
+        ("mbagent/planning", ("mbagent.agent", "mbagent.evaluation")),
+        ("mbagent/adapters", ("mbagent.models", "mbagent.planning", "mbagent.agent", "mbagent.evaluation")),
+        ("scripts/worlds", ("studies",)),
     ],
 )
 def test_data_flows_one_way(folder: str, forbidden: tuple[str, ...]) -> None:
@@ -53,3 +104,75 @@ def test_data_flows_one_way(folder: str, forbidden: tuple[str, ...]) -> None:
                 imported = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
             for name in imported:
                 assert not any(name == f or name.startswith(f + ".") for f in forbidden), f"{path}: {name}"
+
+
+def imports_of(path: Path) -> Iterator[tuple[str, str]]:
+    """(module, name) of all absolute imports from a file, also within functions and TYPE_CHECKING; the name is "" for modules."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, "") for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            yield from ((node.module, alias.name) for alias in node.names)
+
+
+def module_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def test_no_imports_are_circular() -> None:
+    modules = {module_of(p) for p in LIBRARY}
+    graph = {
+        module_of(p): {name for pair in imports_of(p) for name in (".".join(pair), pair[0]) if name in modules} - {module_of(p)}
+        for p in LIBRARY
+        if p.name != "__init__.py"
+    }
+    while free := [module for module, needed in graph.items() if not needed & graph.keys()]:
+        for module in free:
+            del graph[module]
+    assert not graph
+
+
+def test_underscore_modules_are_used_by_their_own_package_only() -> None:
+    for path in SOURCES:
+        for module, name in imports_of(path):
+            package, _, last = module.rpartition(".")
+            if last.startswith("_") and not last.startswith("__"):
+                assert module_of(path).startswith(package), f"{path}: {module} {name}"
+
+
+def top_level_names(path: Path) -> Iterator[str]:
+    """Names of the variables that a module defines."""
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target] if isinstance(node, ast.AnnAssign) else []
+        for target in targets:
+            for name in ast.walk(target):
+                if isinstance(name, ast.Name):
+                    yield name.id
+
+
+def test_constants_and_type_aliases_are_defined_once() -> None:
+    found = defaultdict(list)
+    for path in LIBRARY:
+        for name in top_level_names(path):
+            constant = name.isupper() and len(name) > 2
+            if constant or (name[0].isupper() and name in {"Ints", "Floats", "Bools", "Keys", "States", "Actions", "Words"}):
+                found[name].append(module_of(path))
+    assert {name: where for name, where in found.items() if len(where) > 1} == {}
+
+
+def test_names_that_were_replaced_do_not_come_back() -> None:
+    for path in LIBRARY:
+        with path.open("rb") as file:
+            names = {token.string for token in tokenize.tokenize(file.readline) if token.type == tokenize.NAME}
+        assert not names & FORMER_NAMES, path
+
+
+def test_functions_are_short_in_the_median() -> None:
+    lengths = [
+        lines_without_docstring(node)
+        for path in LIBRARY
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef)
+    ]
+    assert statistics.median(lengths) <= MEDIAN_FUNCTION_LINES

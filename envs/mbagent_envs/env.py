@@ -11,13 +11,13 @@ import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
 
-from mbagent.types import Floats
 from mbagent_envs.drawing import Window, draw_ansi, draw_rgb
 from mbagent_envs.flier_catcher import FlierCatcher
-from mbagent_envs.game import Bits, Game, RewardFn, build_game
+from mbagent_envs.game import Game, RewardFn, build_game
 from mbagent_envs.geyser_runner import GeyserRunner
 from mbagent_envs.maneuverer import Maneuverer
 from mbagent_envs.random_keys import derive, draw_keys
+from mbagent_envs.types import Bits, Floats
 
 GAMES: dict[str, type[Game]] = {
     "GeyserRunner": GeyserRunner,

@@ -7,21 +7,21 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from mbagent.types import Floats
-from mbagent_envs.game import Bits, Game, Scene, Sprite, as_floats, check_flag, check_integer, check_number
+from mbagent_envs.game import Game, Scene, Sprite, as_floats, check_flag, check_integer, check_number
 from mbagent_envs.jit import compiled
-from mbagent_envs.random_keys import KeyArray, uniform_at
+from mbagent_envs.random_keys import uniform_at
+from mbagent_envs.types import Bits, Floats, Keys
 
 
 @compiled
-def _initial(keys: KeyArray, out: Bits) -> None:
+def _initial(keys: Keys, out: Bits) -> None:
     height = out.shape[2]
     for b in range(out.shape[0]):
         out[b, 0, int(uniform_at(keys[b], 0) * height), 0] = 1
 
 
 @compiled
-def _transition(obs: Bits, moves: Bits, keys: KeyArray, spawn_rate: float, out: Bits) -> None:
+def _transition(obs: Bits, moves: Bits, keys: Keys, spawn_rate: float, out: Bits) -> None:
     height, width = obs.shape[2], obs.shape[3]
     for b in range(out.shape[0]):
         row = 0
@@ -105,13 +105,13 @@ class FlierCatcher(Game):
         }
         super().__init__(observation_shape=(2, self.height, self.width), action_names=names, goals=goals)
 
-    def initial(self, keys: KeyArray) -> Bits:
+    def initial(self, keys: Keys) -> Bits:
         """Draw start states; see `Game.initial`."""
         out = np.zeros((len(keys), *self.observation_space.shape), dtype=np.int8)
         _initial(keys, out)
         return out
 
-    def transition(self, obs: Bits, actions: npt.NDArray[Any], keys: KeyArray) -> Bits:
+    def transition(self, obs: Bits, actions: npt.NDArray[Any], keys: Keys) -> Bits:
         """Take one step in every row; see `Game.transition`."""
         out = np.zeros(obs.shape, dtype=np.int8)
         _transition(obs, self._moves[actions], keys, self.spawn_rate, out)

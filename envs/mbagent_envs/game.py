@@ -20,13 +20,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.spaces import Discrete, MultiBinary
 
-from mbagent_envs.random_keys import KeyArray
+from mbagent_envs.types import Bits, Bools, Floats, Ints, Keys
 
-Bits = npt.NDArray[np.int8]
-"""A batch of observations, int8 ``[B, *shape]`` of zeros and ones."""
-Ints = npt.NDArray[np.int64]
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 RewardFn = Callable[[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]], Floats]
 """A goal: ``reward_fn(obs [B, ...], action [B], next_obs [B, ...]) -> float64 [B]``, for any integer type."""
 
@@ -105,11 +100,11 @@ class Game(ABC):
         return f"{type(self).__name__}({arguments})"
 
     @abstractmethod
-    def initial(self, keys: KeyArray) -> Bits:
+    def initial(self, keys: Keys) -> Bits:
         """Draw start states: keys uint64 ``[B]`` -> observations int8 ``[B, *shape]``."""
 
     @abstractmethod
-    def transition(self, obs: Bits, actions: npt.NDArray[Any], keys: KeyArray) -> Bits:
+    def transition(self, obs: Bits, actions: npt.NDArray[Any], keys: Keys) -> Bits:
         """Take one step in every row.
 
         Args:

@@ -8,16 +8,16 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from mbagent.types import Floats
-from mbagent_envs.game import Bits, Game, Scene, Sprite, as_floats, check_flag, check_integer, check_number
+from mbagent_envs.game import Game, Scene, Sprite, as_floats, check_flag, check_integer, check_number
 from mbagent_envs.jit import compiled
-from mbagent_envs.random_keys import KeyArray, uniform_at
+from mbagent_envs.random_keys import uniform_at
+from mbagent_envs.types import Bits, Floats, Keys
 
 MODES = ("stochastic", "deterministic")
 
 
 @compiled
-def _initial(keys: KeyArray, width: int, out: Bits) -> None:
+def _initial(keys: Keys, width: int, out: Bits) -> None:
     geysers = width // 2
     for row in range(out.shape[0]):
         out[row, 0] = 1
@@ -25,7 +25,7 @@ def _initial(keys: KeyArray, width: int, out: Bits) -> None:
 
 
 @compiled
-def _transition(obs: Bits, moves: Bits, keys: KeyArray, width: int, step: int, out: Bits) -> None:
+def _transition(obs: Bits, moves: Bits, keys: Keys, width: int, step: int, out: Bits) -> None:
     geysers = width // 2
     for row in range(out.shape[0]):
         position = 0
@@ -123,13 +123,13 @@ class GeyserRunner(Game):
         }
         super().__init__(observation_shape=(self.width + geysers,), action_names=names, goals=goals)
 
-    def initial(self, keys: KeyArray) -> Bits:
+    def initial(self, keys: Keys) -> Bits:
         """Draw start states; see `Game.initial`."""
         out = np.zeros((len(keys), *self.observation_space.shape), dtype=np.int8)
         _initial(keys, self.width, out)
         return out
 
-    def transition(self, obs: Bits, actions: npt.NDArray[Any], keys: KeyArray) -> Bits:
+    def transition(self, obs: Bits, actions: npt.NDArray[Any], keys: Keys) -> Bits:
         """Take one step in every row; see `Game.transition`."""
         out = np.zeros(obs.shape, dtype=np.int8)
         step = self.cycle_step if self.mode == "deterministic" else 0

@@ -7,10 +7,10 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from mbagent.types import Floats, Ints
-from mbagent_envs.game import Bits, Game, Scene, Sprite, as_floats, check_integer, check_number
+from mbagent_envs.game import Game, Scene, Sprite, as_floats, check_integer, check_number
 from mbagent_envs.jit import compiled
-from mbagent_envs.random_keys import KeyArray, uniform_at
+from mbagent_envs.random_keys import uniform_at
+from mbagent_envs.types import Bits, Floats, Ints, Keys
 
 ROW_MOVES = np.array([-1, 0, 1, 0], dtype=np.int64)
 COLUMN_MOVES = np.array([0, 1, 0, -1], dtype=np.int64)
@@ -79,7 +79,7 @@ def _draw_layout(key: np.uint64, density: float, row: int, column: int, planes: 
 
 
 @compiled
-def _initial(keys: KeyArray, density: float, out: Bits) -> None:
+def _initial(keys: Keys, density: float, out: Bits) -> None:
     size = out.shape[2]
     for b in range(out.shape[0]):
         start = int(uniform_at(keys[b], size * size + 1) * size * size)
@@ -87,7 +87,7 @@ def _initial(keys: KeyArray, density: float, out: Bits) -> None:
 
 
 @compiled
-def _transition(obs: Bits, actions: Ints, keys: KeyArray, density: float, out: Bits) -> None:
+def _transition(obs: Bits, actions: Ints, keys: Keys, density: float, out: Bits) -> None:
     size = obs.shape[2]
     for b in range(out.shape[0]):
         cell = 0
@@ -188,13 +188,13 @@ class Maneuverer(Game):
             goals=goals,
         )
 
-    def initial(self, keys: KeyArray) -> Bits:
+    def initial(self, keys: Keys) -> Bits:
         """Draw start states; see `Game.initial`."""
         out = np.zeros((len(keys), *self.observation_space.shape), dtype=np.int8)
         _initial(keys, self.wall_density, out)
         return out
 
-    def transition(self, obs: Bits, actions: npt.NDArray[Any], keys: KeyArray) -> Bits:
+    def transition(self, obs: Bits, actions: npt.NDArray[Any], keys: Keys) -> Bits:
         """Take one step in every row; see `Game.transition`."""
         out = np.zeros(obs.shape, dtype=np.int8)
         _transition(obs, actions.astype(np.int64, copy=False), keys, self.wall_density, out)

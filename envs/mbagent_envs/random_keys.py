@@ -15,8 +15,7 @@ import numpy.typing as npt
 from numpy.typing import NDArray
 
 from mbagent_envs.jit import compiled
-
-KeyArray = npt.NDArray[np.uint64]
+from mbagent_envs.types import Keys
 
 _GAMMA = np.uint64(0x9E3779B97F4A7C15)  # step of splitmix64: 2**64 / golden ratio, odd
 _SALT_GAMMA = np.uint64(0xD1342543DE82EF95)  # another odd step, so that derived keys do not repeat their parent's stream
@@ -48,7 +47,7 @@ def derive_one(key: np.uint64, salt: np.uint64) -> np.uint64:
 
 
 @compiled
-def _derive_rows(keys: KeyArray, salts: KeyArray, out: KeyArray) -> None:
+def _derive_rows(keys: Keys, salts: Keys, out: Keys) -> None:
     key_step, salt_step = min(keys.shape[0] - 1, 1), min(salts.shape[0] - 1, 1)  # 0 if one is used for all rows
     for row in range(out.shape[0]):
         out[row] = derive_one(keys[row * key_step], salts[row * salt_step])
@@ -64,12 +63,12 @@ def fill_row(key: np.uint64, out: npt.NDArray[np.float64]) -> None:
 
 
 @compiled
-def _fill_uniforms(keys: KeyArray, out: npt.NDArray[np.float64]) -> None:
+def _fill_uniforms(keys: Keys, out: npt.NDArray[np.float64]) -> None:
     for row in range(out.shape[0]):
         fill_row(keys[row], out[row])
 
 
-def as_keys(keys: npt.ArrayLike) -> KeyArray:
+def as_keys(keys: npt.ArrayLike) -> Keys:
     """Return ``keys`` as a uint64 array of at least one axis; negative integers wrap around.
 
     Raises:
@@ -98,7 +97,7 @@ def uniforms(keys: npt.ArrayLike, n: int) -> npt.NDArray[np.float64]:
     return out
 
 
-def derive(keys: npt.ArrayLike, *salt: npt.ArrayLike) -> KeyArray:
+def derive(keys: npt.ArrayLike, *salt: npt.ArrayLike) -> Keys:
     """Return new keys, independent of the given ones and of each other, one for each (key, salt ...).
 
     Args:
@@ -125,7 +124,7 @@ def derive(keys: npt.ArrayLike, *salt: npt.ArrayLike) -> KeyArray:
     return result
 
 
-def draw_keys(rng: np.random.Generator, n: int) -> KeyArray:
+def draw_keys(rng: np.random.Generator, n: int) -> Keys:
     """Draw ``n`` new keys, uint64 ``[n]``, from a generator."""
     return rng.integers(0, 2**64, size=n, dtype=np.uint64)
 

@@ -12,13 +12,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mbagent.types import Floats, Ints
 from mbagent_envs.flier_catcher import FlierCatcher
-from mbagent_envs.game import Bits, Game, RewardFn
+from mbagent_envs.game import Game, RewardFn
 from mbagent_envs.geyser_runner import GeyserRunner
 from mbagent_envs.jit import compiled
 from mbagent_envs.maneuverer import Maneuverer
 from mbagent_envs.random_keys import derive
+from mbagent_envs.types import Bits, Floats, Ints
 
 ReferencePolicy = Callable[[Bits], Ints]
 """Observations int8 ``[B, *shape]`` -> actions int64 ``[B]``."""

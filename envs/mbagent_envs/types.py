@@ -11,4 +11,4 @@ Bools: TypeAlias = npt.NDArray[np.bool_]
 Keys: TypeAlias = npt.NDArray[np.uint64]
 """Keys of counter-based random numbers, see ``random_keys``."""
 Bits: TypeAlias = npt.NDArray[np.int8]
-"""Observations of the games."""
+"""A batch of observations, int8 ``[B, *shape]`` of zeros and ones."""

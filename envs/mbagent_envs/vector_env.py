@@ -13,11 +13,11 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from mbagent.types import Bools, Floats
 from mbagent_envs.drawing import draw_ansi, draw_rgb
 from mbagent_envs.env import GameEnv, check_options, check_render_mode, resolve_game
-from mbagent_envs.game import Bits, Game, check_integer
+from mbagent_envs.game import Game, check_integer
 from mbagent_envs.random_keys import derive, draw_keys
+from mbagent_envs.types import Bits, Bools, Floats
 
 
 class GameVectorEnv(gym.vector.VectorEnv[Bits, npt.NDArray[Any], npt.NDArray[Any]]):

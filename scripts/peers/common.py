@@ -25,7 +25,7 @@ Search: TypeAlias = "Callable[[Array, int, int], tuple[Array, int]]"
 
 @dataclass(frozen=True)
 class Task:
-    """What to do; see ``mbagent.analysis.planning_benchmark.peers``.
+    """What to do; see ``studies.planning.peers``.
 
     Attributes:
         arrays: the world.

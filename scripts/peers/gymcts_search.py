@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from scripts.peers.common import Array, read_task, run, stay_on_one_core
+from peers.common import Array, read_task, run, stay_on_one_core
 
 stay_on_one_core()
 

@@ -12,7 +12,7 @@ import sysconfig
 from pathlib import Path
 from typing import Any
 
-from scripts.peers.common import Array, read_task, run, stay_on_one_core
+from peers.common import Array, read_task, run, stay_on_one_core
 
 stay_on_one_core()
 

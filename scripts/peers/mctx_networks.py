@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scripts.peers.common import stay_on_one_core
+from peers.common import stay_on_one_core
 
 stay_on_one_core()
 

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scripts.peers.common import Array, Search, read_task, run, stay_on_one_core
+from peers.common import Array, Search, read_task, run, stay_on_one_core
 
 stay_on_one_core()
 

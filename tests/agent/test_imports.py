@@ -8,8 +8,8 @@ import pytest
 ROOT = Path(__file__).parents[2]
 FORBIDDEN = {
     "envs/mbagent_envs": ("mbagent",),
-    "mbagent/models": ("mbagent.planning", "mbagent.agent", "mbagent.policies", "mbagent.analysis"),
-    "mbagent/planning": ("mbagent.agent", "mbagent.policies", "mbagent.analysis"),
+    "mbagent/models": ("mbagent.planning", "mbagent.agent", "mbagent.policies", "mbagent.evaluation"),
+    "mbagent/planning": ("mbagent.agent", "mbagent.policies", "mbagent.evaluation"),
 }
 
 
@@ -32,7 +32,7 @@ def test_imports_go_one_way(folder: str) -> None:
 
 def test_the_agent_and_all_below_it_name_no_environment() -> None:
     for path in sorted((ROOT / "mbagent").rglob("*.py")):
-        if "analysis" in path.parts or path.name == "__init__.py":
+        if "evaluation" in path.parts or path.name == "__init__.py":
             continue
         text = path.read_text(encoding="utf-8")
         for name in ("GeyserRunner", "Maneuverer", "FlierCatcher", "FrozenLake", "Taxi"):

@@ -10,9 +10,10 @@ import numpy.typing as npt
 
 from mbagent.types import Bools, Floats
 from mbagent_envs import FlierCatcher, Game, GeyserRunner, Maneuverer, RewardFn
-from mbagent_envs.game import Bits, Scene, Sprite, as_floats
-from mbagent_envs.random_keys import KeyArray, derive, uniforms
+from mbagent_envs.game import Scene, Sprite, as_floats
+from mbagent_envs.random_keys import derive, uniforms
 from mbagent_envs.references import ReferencePolicy
+from mbagent_envs.types import Bits, Keys
 
 VARIANTS: dict[str, list[dict[str, Any]]] = {
     "mbagent/GeyserRunner-v0": [
@@ -55,12 +56,12 @@ class Lottery(Game):
         self.prize = prize
         super().__init__(observation_shape=(3,), action_names=("wait", "go"), goals={})
 
-    def initial(self, keys: KeyArray) -> Bits:
+    def initial(self, keys: Keys) -> Bits:
         out = np.zeros((len(keys), 3), dtype=np.int8)
         out[:, 0] = 1
         return out
 
-    def transition(self, obs: Bits, actions: npt.NDArray[Any], keys: KeyArray) -> Bits:
+    def transition(self, obs: Bits, actions: npt.NDArray[Any], keys: Keys) -> Bits:
         lit = (uniforms(keys, 1)[:, 0] * 3).astype(np.int64)
         return np.where(actions[:, None] == 1, np.eye(3, dtype=np.int8)[lit], obs)
 

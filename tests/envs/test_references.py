@@ -3,8 +3,8 @@ import pytest
 
 from mbagent.types import Ints
 from mbagent_envs import FlierCatcher, Game, GeyserRunner, Maneuverer, RewardFn
-from mbagent_envs.game import Bits
 from mbagent_envs.references import geyser_states, geyser_values, reference_policy
+from mbagent_envs.types import Bits
 from tests.envs.helpers import DEFAULTS, GAMES, Lottery, returns, wandered_states
 from tests.envs.test_maneuverer import board
 

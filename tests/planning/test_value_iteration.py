@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from mbagent.analysis.planning_benchmark.crowds import IndependentModel
 from mbagent.models import SimulatorModel
 from mbagent.models.base import BaseTransitionModel
 from mbagent.models.mdp import ReachableMDP, StateGraph, grow_reachable
@@ -13,6 +12,7 @@ from mbagent.planning.value_iteration import MOST_SMALL_SAMPLES, SolvedMdp, solv
 from mbagent.types import Actions, States
 from mbagent_envs.geyser_runner import GeyserRunner
 from tests.worlds import TableWorld, arrival_goal, optimal_q, random_table
+from worlds.coupled import IndependentModel
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from scripts.compare_agents import Args, main, settings_of
-from tests.analysis.fakes import FakeAgent, fake_baseline
+from compare_agents import Args, main, settings_of
+from tests.scripts.fakes import FakeAgent, fake_baseline
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "compare_agents.py"
 CASE = ["--cases", "geyser_high_cost"]
@@ -22,8 +22,8 @@ def test_help_documents_every_option() -> None:
 def test_the_script_writes_report_and_table_and_can_write_the_report_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("mbagent.analysis.jobs.ModelLearningAgent", FakeAgent)
-    monkeypatch.setattr("mbagent.analysis.jobs.train_baseline", fake_baseline)
+    monkeypatch.setattr("studies.comparison.jobs.ModelLearningAgent", FakeAgent)
+    monkeypatch.setattr("studies.comparison.jobs.train_baseline", fake_baseline)
     options = [*TINY, "--output", str(tmp_path)]
     assert main(options) == 0
     assert "jobs" not in capsys.readouterr().err
@@ -50,7 +50,7 @@ def test_mistakes_get_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_a_new_run_deletes_nothing_but_what_an_earlier_one_wrote(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("mbagent.analysis.jobs.ModelLearningAgent", FakeAgent)
+    monkeypatch.setattr("studies.comparison.jobs.ModelLearningAgent", FakeAgent)
     (tmp_path / "records").mkdir()
     (tmp_path / "records" / "precious.txt").write_text("mine")
     options = [*TINY, "--baselines", "--no-curves", "--output", str(tmp_path)]

@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from scripts import kill_test
-from scripts.kill_test import Args, main, rows_of, version_of
+import kill_test
+from kill_test import Args, main, rows_of, version_of
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")

@@ -80,8 +80,9 @@ def _sound(graphs: Graphs, layout: Layout, n_features: int) -> bool:
         "base": start[-1],
         "still": 1,
     }
-    if any(len(getattr(graphs, name)) != length for name, length in lengths.items()):
+    if any(len(getattr(graphs, SAVED[name])) != length for name, length in lengths.items()):
         return False
+    shares = [getattr(graphs, SAVED[name]) for name in _FLOATS]
     asks, numbers = graphs.feature >= 0, np.arange(n_nodes)
     return bool(
         _within(graphs.changing, n_variables)
@@ -92,8 +93,7 @@ def _sound(graphs: Graphs, layout: Layout, n_features: int) -> bool:
         and ((graphs.off >= 0) & (graphs.off < numbers))[asks].all()
         and ((graphs.on >= 0) & (graphs.on < numbers))[asks].all()
         and _values_fit(graphs, layout)
-        and all(np.isfinite(getattr(graphs, name)).all() for name in _FLOATS)
-        and all((getattr(graphs, name) >= 0.0).all() and (getattr(graphs, name) <= 1.0).all() for name in _FLOATS)
+        and all(np.isfinite(share).all() and (share >= 0.0).all() and (share <= 1.0).all() for share in shares)
         and (np.add.reduceat(graphs.base, start[:-1]) <= 1.0 + 1e-6).all()
     )
 

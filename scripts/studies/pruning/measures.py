@@ -1,0 +1,142 @@
+"""How well a learned model knows its game, and what a sampled next state costs."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from mbagent.models.neural.model import NeuralTransitionModel, PrunedAs
+from mbagent.models.neural.network_pair import NeuralConfig
+from mbagent.models.simulator import SimulatorModel
+from mbagent_envs.random_keys import derive
+from studies.planning.sampling import EVERYTHING, microseconds, using
+from worlds.games import Case
+from worlds.synthetic_dbn import random_data, random_inputs, trained
+
+ROWS = 1024
+"""States that are drawn from at once when it is timed."""
+
+CONDITIONED, PAPER = "every variable conditioned", "the paper's networks, 5 sweeps"
+"""Networks of the same game that are timed beside the learned ones."""
+
+
+class Speeds(NamedTuple):
+    """Microseconds of processor time of a sampled next state.
+
+    Attributes:
+        full: by whole matrices, every variable asked of the conditioner that has a group there.
+        matrices: by whole matrices, without what the predictor is sure of.
+        connections: by lists of what is left.
+        used: as the model is sampled from: by tables, and by lists where a variable has too many parents.
+        variation: upper bound of the total variation between the last and ``matrices``: 95% limit of the share of draws that
+            differ under the same random numbers.
+    """
+
+    full: float
+    matrices: float
+    connections: float
+    used: float
+    variation: float
+
+
+def measure_speeds(model: NeuralTransitionModel, states: Any, actions: Any, seed: int) -> Speeds:
+    """Of a model, on states int64 [B, F] and actions int64 [B]."""
+    keys, few = derive(seed, np.arange(len(states))), slice(0, ROWS)
+
+    def timed(certain: float, pruned_as: PrunedAs) -> float:
+        with using(model, certain, model.config.sweeps, pruned_as):
+            return microseconds(partial(model.sample, states[few], actions[few], keys[few]), len(states[few]))
+
+    drawn = []
+    for pruned_as in ("matrices", "tables"):
+        with using(model, model.config.certain, model.config.sweeps, pruned_as):
+            drawn.append(np.column_stack(model.sample(states, actions, keys)))
+    differ, certain = int((drawn[0] != drawn[1]).any(axis=1).sum()), model.config.certain
+    limit = stats.beta.ppf(0.95, differ + 1, len(states) - differ)  # Clopper and Pearson
+    return Speeds(
+        timed(EVERYTHING, "matrices"),
+        timed(certain, "matrices"),
+        timed(certain, "connections"),
+        timed(certain, "tables"),
+        float(limit) if model.rules() is not None else 0.0,
+    )
+
+
+def measure_others(model: NeuralTransitionModel, states: Any, actions: Any, seed: int) -> dict[str, float]:
+    """What a next state costs by networks that condition every variable, as the paper's do; with random weights."""
+    keys, found = derive(seed, np.arange(ROWS)), {}
+    for name, config in ((CONDITIONED, NeuralConfig()), (PAPER, NeuralConfig.paper(len(model.cardinalities)))):
+        other = NeuralTransitionModel(model.cardinalities, model.n_actions, config, seed=seed)
+        with using(other, EVERYTHING, config.sweeps):
+            found[name] = microseconds(partial(other.sample, states[:ROWS], actions[:ROWS], keys), ROWS)
+    return found
+
+
+class SizeRow(NamedTuple):
+    """A world of d bits, of which few are ever open, learned and pruned.
+
+    Attributes:
+        d, seed: which.
+        connections: that are left.
+        whole: microseconds of a next state before pruning.
+        pruned: after it.
+    """
+
+    d: int
+    seed: int
+    connections: int
+    whole: float
+    pruned: float
+
+
+def measure_size(d: int, seed: int, fraction: float = 0.9) -> SizeRow:
+    """Learns, prunes and times a world of d bits."""
+    model, data = trained("networks", d, seed), random_data(d, 6000, seed)
+    states, actions = random_inputs(d, ROWS, np.random.default_rng([seed, d, 2]))
+    call = partial(model.sample, states, actions, derive(seed, np.arange(ROWS)))
+    whole = microseconds(call, ROWS)
+    model.prune(data, fraction, seed=seed)
+    return SizeRow(d, seed, sum(part.left for part in model.connections().values()), whole, microseconds(call, ROWS))
+
+
+def unseen_play(case: Case, seed: int, n: int = 2000) -> tuple[Any, Any, Any]:
+    """States, actions and next states int64 of random play that no agent learns from."""
+    game, rng = case.game, np.random.default_rng([seed, 77])
+    assert game is not None
+    obs, rows = game.initial(derive(seed, np.arange(n // 100), 7)), []
+    for step in range(100):
+        actions = rng.integers(len(game.action_names), size=len(obs))
+        after = game.transition(obs, actions, derive(seed, np.arange(len(obs)), 8, step))
+        rows.append((obs.reshape(len(obs), -1), actions, after.reshape(len(obs), -1)))
+        obs = after
+    states, taken, following = (np.concatenate(part).astype(np.int64) for part in zip(*rows, strict=True))
+    return states, taken, following
+
+
+def excess(case: Case, model: NeuralTransitionModel, states: Any, actions: Any, following: Any) -> float:
+    """Nats a transition that the model loses on the true distribution; nan where either has no exact probabilities."""
+    game, alive = case.game, np.zeros(len(states), dtype=np.bool_)
+    assert game is not None
+    try:
+        ours = model.log_prob(states, actions, following, alive)
+        obs = states.reshape(-1, *game.observation_space.shape).astype(np.int8)
+        outcomes, chances = game.transition_distributions(obs, actions)
+    except NotImplementedError:
+        return float("nan")
+    same = (outcomes.reshape(*chances.shape, -1) == following[:, None]).all(axis=2)
+    return float((np.log((chances * same).sum(axis=1)) - ours).mean())
+
+
+def marginal_error(case: Case, model: NeuralTransitionModel, states: Any, actions: Any, n_draws: int = 200) -> float:
+    """Total variation of single variables between draws of the model and of the game, mean over inputs and variables."""
+    game = case.game
+    assert game is not None
+    row = np.repeat(np.arange(len(states)), n_draws)
+    means = []
+    for which, one in ((1, model), (2, SimulatorModel(game))):
+        drawn, _ = one.sample(states[row], actions[row], derive(which, np.arange(len(row))))
+        means.append(drawn.reshape(len(states), n_draws, -1).mean(axis=1))
+    return float(np.abs(means[0] - means[1]).mean())

@@ -1,0 +1,1 @@
+"""The environments that the studies use, and their exact rules where these are known."""
