@@ -151,6 +151,4 @@ def policy_name(policy_class: type[BasePolicy], aliases: Mapping[str, type[BaseP
     for name, known in aliases.items():
         if known is policy_class:
             return name
-    raise ValueError(
-        f"The policy {policy_class.__name__} has no name for saving; add it to ModelLearningAgent.policy_aliases."
-    )
+    raise ValueError(f"The policy {policy_class.__name__} has no name for saving; add it to ModelLearningAgent.policy_aliases.")

@@ -12,7 +12,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from mbagent import LearnedEnv, ModelLearningAgent
-from tests.agent.test_drop_in import Bytes, Told
+from tests.agent.test_drop_in import Bytes, Converted
 from tests.worlds import Corridor
 
 ON_CHECKS = pytest.mark.filterwarnings("ignore:.*render", "ignore:.*unwrapped version")
@@ -42,7 +42,7 @@ def test_it_passes_the_checks_of_gymnasium_and_sb3(kind: str) -> None:
     worlds = {
         "number": Corridor(limit=50),
         "bytes": Bytes(Corridor(limit=50)),
-        "tuple": Told(spaces.Tuple((spaces.Discrete(2), spaces.Discrete(3))), lambda at: (at % 2, at // 2)),
+        "tuple": Converted(spaces.Tuple((spaces.Discrete(2), spaces.Discrete(3))), lambda at: (at % 2, at // 2)),
     }
     env = LearnedEnv(learned(worlds[kind]), max_episode_steps=20)
     assert env.observation_space == worlds[kind].observation_space
