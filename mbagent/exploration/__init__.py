@@ -1,4 +1,4 @@
-"""Reward-free exploration: random, persistent, or directed at what was seldom visited."""
+"""Reward-free exploration: random, persistent, or directed at rarely visited (state, action) pairs."""
 
 from mbagent.exploration.strategies import DirectedExploration, Exploration, PersistentExploration, RandomExploration
 

@@ -1,4 +1,4 @@
-"""How to act while learning. Nothing here ever sees a reward."""
+"""Exploration strategies: action selection while learning, without rewards."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from mbagent.exploration.visit_counts import START_NODE, VisitTable
 from mbagent.types import Actions, Bools, States
 
 FEW_STATES, STEPS_PER_STATE = 64, 8
-"""States are few enough for a table where there are so many at most, and one more for each so many steps."""
+"""States are few if their number is at most FEW_STATES + steps / STEPS_PER_STATE."""
 
 MANY_STATES = 50_000
-"""More than this are not kept in a table."""
+"""Maximum number of states in a table."""
 
 MANY_VALUES = 40_000_000
-"""Values of factors, mostly of a byte each, that are kept to look at which of them actions reach."""
+"""Maximum number of values of factors, mostly of a byte each, that are kept for the test of controllability."""
 
 FIRST_COUNT = 256
-"""Steps before the first look, if there are too many states by then."""
+"""Number of steps before the first test of controllability, if there are too many states by then."""
 
 STEPS_TOGETHER = 256
-"""Steps that are counted at once while they direct nothing."""
+"""Number of steps that are counted together while exploration is not directed."""
 
 
 class Exploration(Protocol):
@@ -40,22 +40,22 @@ class Exploration(Protocol):
 
 @runtime_checkable
 class Watching(Protocol):
-    """An exploration that is told what its actions led to; never a reward."""
+    """An exploration strategy that observes the transitions, but not the rewards."""
 
     def observe(self, states: States, actions: Actions, next_states: States, ended: Bools) -> None:
-        """A step of each environment.
+        """Records one step of each environment.
 
         Args:
             states: int64 [B, F], numbered as declared.
             actions: int64 [B].
-            next_states: int64 [B, F], where an episode ended its last.
-            ended: whether the episode ended there, by the world's rules or by a limit of steps, bool [B].
+            next_states: int64 [B, F]; if an episode ended, its last state.
+            ended: whether the episode was terminated or truncated, bool [B].
         """
         ...
 
 
 class RandomExploration:
-    """Every action equally often, as the paper's agents explore (section 4.4).
+    """Uniformly random actions, as in the paper (section 4.4).
 
     Args:
         n_actions: number of enumerated actions.
@@ -71,14 +71,14 @@ class RandomExploration:
 
 
 class PersistentExploration:
-    """Random actions that are kept for a while, each step with probability ``keep``.
+    """Random actions, each of which is repeated with probability ``keep`` at every step.
 
-    For worlds in which single steps lead nowhere, as those made from continuous ones: what pushes now this way, now that, stays
-    where it is.
+    For environments in which single actions have little effect, such as discretised continuous ones: pushes in alternating
+    directions cancel each other.
 
     Args:
         n_actions: number of enumerated actions.
-        keep: probability that the last action goes on, at least 0 and below 1.
+        keep: probability that the last action is repeated, at least 0 and below 1.
 
     Raises:
         ValueError: ``keep`` is out of range.
@@ -102,23 +102,23 @@ class PersistentExploration:
 
 
 class DirectedExploration:
-    """To what was tried least, by counts over the states met; where there are too many states, every action equally often.
+    """Exploration by visit counts, directed at the pairs tried least; uniformly random if there are too many states.
 
-    Where random steps seldom get far (holes, cliffs, long corridors, things that take several steps in the right order), it is
-    far ahead of them. It needs states that are met again: a table of visits says nothing about a state never seen. Where there
-    are too many of them, it looks again each time the steps have doubled whether they are few in what actions have a say in
-    (see ``controllability.py``), and counts in that alone: lights that flicker whatever is done make every state a new one, and
-    do not matter for where to go.
+    It is far better than random actions where these seldom get far (holes, cliffs, long corridors, tasks of several steps in the
+    right order). It needs states that recur, since a table of visits has no information on unobserved states. If there are too
+    many states, it tests each time the number of steps has doubled whether there are few abstract states of controllable factors
+    (see ``controllability.py``), and counts only these: uncontrollable distractors make almost every state novel, but are
+    irrelevant for exploration.
 
     Args:
         n_actions: number of enumerated actions.
-        few: True to be directed only while states are few: no more than FEW_STATES + steps / STEPS_PER_STATE different ones
-            met; False to be directed up to MANY_STATES. Otherwise actions are drawn as RandomExploration draws them.
+        few: True to be directed only while states are few, at most FEW_STATES + steps / STEPS_PER_STATE distinct ones; False to
+            be directed up to MANY_STATES. Otherwise actions are those of RandomExploration.
 
     Attributes:
-        table: what was tried; None where there were more than MANY_STATES, until fewer factors are found to tell them apart by.
-        view: what states are told apart by; None for all that they are.
-        n_steps: steps observed.
+        table: visit counts; None after more than MANY_STATES states, until an abstraction with fewer states is found.
+        view: state abstraction in use; None if states are counted unchanged.
+        n_steps: number of observed steps.
     """
 
     def __init__(self, n_actions: int, few: bool = False) -> None:
@@ -136,12 +136,12 @@ class DirectedExploration:
 
     @property
     def directed(self) -> bool:
-        """Whether it looks for what was tried least at present."""
+        """Whether exploration is currently directed by visit counts."""
         return self.table is not None and len(self.table) <= self._most
 
     @property
     def _most(self) -> float:
-        """The number of states up to which it is directed."""
+        """Maximum number of states for directed exploration."""
         return min(MANY_STATES, FEW_STATES + self.n_steps / STEPS_PER_STATE) if self._few else MANY_STATES
 
     def act(self, states: States, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -154,29 +154,29 @@ class DirectedExploration:
         """See Watching."""
         began = self._ended if len(self._ended) == len(ended) else np.ones(len(ended), dtype=np.bool_)
         self._ended = np.array(ended, dtype=np.bool_)
-        self._take(_Steps(states, actions, next_states, self._ended, began))
+        self._add_steps(_Steps(states, actions, next_states, self._ended, began))
 
     def recall(self, rows: TransitionBatch) -> None:
-        """Takes steps that were made without it; all their episodes are over."""
+        """Records transitions that it did not observe; all their episodes must have ended."""
         rows = rows.select(np.argsort(rows.episodes, kind="stable"))
         change = rows.episodes[1:] != rows.episodes[:-1]
-        self._take(_Steps(rows.before, rows.actions, rows.after, np.append(change, True), np.append(True, change)))
+        self._add_steps(_Steps(rows.before, rows.actions, rows.after, np.append(change, True), np.append(True, change)))
 
-    def _take(self, steps: _Steps) -> None:
+    def _add_steps(self, steps: _Steps) -> None:
         self.n_steps += len(steps.actions)
-        look = self.n_steps >= self._reconsider_at
+        due = self.n_steps >= self._reconsider_at
         if self._kept is not None:
             self._unkept.append(steps)
             self._n_unkept += len(steps.actions)
-            if look or self._n_unkept >= STEPS_TOGETHER:
+            if due or self._n_unkept >= STEPS_TOGETHER:
                 self._keep(self._kept)
         if self.table is not None:
             self._uncounted.append(steps)
             self._n_uncounted += len(steps.actions)
-            if look or self.directed or self._n_uncounted >= STEPS_TOGETHER:  # many steps at once cost less for each
+            if due or self.directed or self._n_uncounted >= STEPS_TOGETHER:  # counting many steps at once is faster
                 self._count(self.table, _joined(self._uncounted))
                 self._uncounted, self._n_uncounted = [], 0
-        if look:
+        if due:
             self._reconsider_at = 2 * self.n_steps
             self._reconsider()
 
@@ -184,7 +184,7 @@ class DirectedExploration:
         return table.add(states.astype(np.int64, copy=False) if self.view is None else self.view(states))
 
     def _count(self, table: VisitTable, steps: _Steps) -> None:
-        """Enters steps into the table."""
+        """Adds steps to the table."""
         nodes, targets = self._nodes(table, steps.states), np.full(len(steps.states), START_NODE)
         targets[~steps.ended] = self._nodes(table, steps.next_states[~steps.ended])
         table.begin(nodes[steps.began])
@@ -193,7 +193,7 @@ class DirectedExploration:
             self.table = None
 
     def _keep(self, kept: list[_Steps]) -> None:
-        """Keeps steps for later looks; as soon as that is too much, a last look is taken, and all is let go."""
+        """Keeps steps for later tests; if they exceed MANY_VALUES, makes a last test and discards all of them."""
         kept.append(_joined(self._unkept).narrowed())
         self._unkept, self._n_unkept = [], 0
         self._n_kept += 2 * kept[-1].states.size
@@ -202,7 +202,10 @@ class DirectedExploration:
             self._kept = None
 
     def _reconsider(self) -> None:
-        """Settles how states are told apart: by all, if they are few then; else by what actions reach; else by what they do."""
+        """Chooses the finest of three representations of states that has few of them.
+
+        These are all factors; the factors that actions reach directly or through others; and what depends on actions directly.
+        """
         if self._kept is None or (self.view is None and self.directed):
             return
         steps = _joined(self._kept)
@@ -210,12 +213,12 @@ class DirectedExploration:
         if _distinct(steps.states) <= self._most:
             view = None
         else:
-            met = steps.states, steps.actions, steps.next_states
-            found = find_controllable(*met, self._random.n_actions)
+            data = steps.states, steps.actions, steps.next_states
+            found = find_controllable(*data, self._random.n_actions)
             view = StateAbstraction(found, np.zeros_like(found.directly))
             if not found.directly.any() or _distinct(view(steps.states)) > self._most:
                 return
-            finer = StateAbstraction(found, find_reached(found, *met))
+            finer = StateAbstraction(found, find_reached(found, *data))
             view = finer if _distinct(finer(steps.states)) <= self._most else view
         if self.table is None or not (view.same_as(self.view) if view is not None else self.view is None):
             self.view, self.table = view, VisitTable(self._random.n_actions)
@@ -224,7 +227,7 @@ class DirectedExploration:
 
 
 class _Steps(NamedTuple):
-    """Steps [N]: states int [N, F], actions, next states, whether an episode ended with it, and began with it."""
+    """Steps [N]: states int [N, F], actions, next states, whether an episode ended with the step, or began with it."""
 
     states: NDArray[np.integer[Any]]
     actions: Actions
@@ -233,7 +236,7 @@ class _Steps(NamedTuple):
     began: Bools
 
     def narrowed(self) -> _Steps:
-        """The same with states in the smallest integers that hold them."""
+        """The same steps with states of the smallest sufficient integer type."""
         kind = np.min_scalar_type(max(int(self.states.max(initial=0)), int(self.next_states.max(initial=0))))
         return self._replace(states=self.states.astype(kind), next_states=self.next_states.astype(kind))
 
@@ -249,7 +252,7 @@ def _distinct(states: NDArray[np.integer[Any]]) -> int:
 
 
 def catch_up(exploration: Exploration, data: TransitionDataset) -> None:
-    """Tells directed exploration of the transitions that it did not see, such as those from a file."""
+    """Passes transitions that directed exploration did not observe to it, such as those from a file."""
     if isinstance(exploration, DirectedExploration) and exploration.n_steps < len(data):
         exploration.recall(data.rows().select(slice(exploration.n_steps, None)))
 
@@ -260,4 +263,4 @@ EXPLORATIONS: dict[str, Callable[[int], Exploration]] = {
     "random": RandomExploration,
     "persistent": PersistentExploration,
 }
-"""What the ``exploration`` argument of the agent may name."""
+"""Strategies by their names for the ``exploration`` argument of the agent."""

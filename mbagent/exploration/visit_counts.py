@@ -1,4 +1,4 @@
-"""How often each (state, action) was tried and where it led, and how to get to what was tried least."""
+"""Visit counts of (state, action) pairs, and value iteration with the exploration bonus of MBIE-EB."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ from mbagent.types import Actions, Floats, Ints, States
 from mbagent_envs.jit import compiled
 
 DISCOUNT = 0.99
-"""Of a step, where the worth of going somewhere is worked out."""
+"""Discount of a step for the values of states under the bonus."""
 
 UNTRIED = 1.0 / (1.0 - DISCOUNT) + 1.0
-"""Worth of an action never tried: no sum of discounted bonuses, of which the first is 1, is as much."""
+"""Value of an untried action: larger than any sum of discounted bonuses, which are at most 1."""
 
 TIE = 1e-6
-"""Actions that differ by less are chosen between by lot."""
+"""Actions whose values differ by less than this are chosen at random."""
 
 WORK = 4096
-"""Pairs and outcomes looked at in each step, at most: some tens of microseconds."""
+"""Approximate number of pairs and outcomes that value iteration updates in each step: some tens of microseconds."""
 
 START_NODE = 0
-"""The node that stands for "a new episode begins"."""
+"""The node that represents the start of a new episode."""
 
 
 class VisitArrays(NamedTuple):
-    """What compiled code needs of a VisitTable, with room to grow; N nodes and M outcomes of them are in use.
+    """Arrays of a VisitTable for compiled code, with spare capacity; N nodes and M outcomes are in use.
 
     Attributes:
-        tried: how often each action was taken, int64 [room, A]; of node START_NODE, column 0, how many episodes began.
-        first: number of the first outcome of each (node, action), -1 where there is none, int64 [room, A].
-        worth: discounted sum of the bonuses that can be had from a node on, float64 [room].
-        target: the node that an outcome leads to, int64 [room].
-        times: how often it was met, int64 [room].
-        following: number of the next outcome of the same (node, action), -1 after the last, int64 [room].
+        tried: visit count of each action, int64 [room, A]; of node START_NODE, in column 0, the number of episodes begun.
+        first: index of the first outcome of each (node, action), -1 if there is none, int64 [room, A].
+        worth: value of each node, the discounted sum of bonuses from it on, float64 [room].
+        target: the node to which an outcome leads, int64 [room].
+        times: number of times that the outcome was observed, int64 [room].
+        following: index of the next outcome of the same (node, action), -1 after the last one, int64 [room].
         sizes: N and M, int64 [2].
     """
 
@@ -48,13 +48,13 @@ class VisitArrays(NamedTuple):
 
 
 class VisitTable:
-    """Counts over all states met, and the way to what was tried least. It has no place for a reward.
+    """Visit counts of all observed states, and the actions that lead to rarely tried pairs. Rewards are not used.
 
-    The empirical machine of the states met is solved for a bonus 1 / sqrt(n) for a (state, action) tried n times (Strehl &
-    Littman 2008, here with no reward beside it), by value iteration that goes on a little at every step. Actions never
-    tried are worth more than any others. Where an episode ended, the worth is that of the states in which episodes begin:
-    an end would else look like a place where nothing can be found out any more. That holds for limits of steps, too: who
-    is stuck until one comes is not stuck for ever.
+    The empirical MDP of the observed states is solved for a bonus of 1 / sqrt(n) for a (state, action) tried n times (Strehl &
+    Littman 2008, here without rewards), by value iteration that continues for a few updates at every step. Untried actions
+    have a higher value than all others. The value at the end of an episode is that of the start states: otherwise terminal
+    states would appear to have no exploration value. The same applies to truncation, since an agent that is stuck continues
+    in a new episode.
 
     Args:
         n_actions: number of enumerated actions A.
@@ -69,11 +69,11 @@ class VisitTable:
         self._at, self._upwards = 0, False
 
     def __len__(self) -> int:
-        """Number of distinct states met."""
+        """Number of distinct observed states."""
         return int(self._arrays.sizes[0]) - 1
 
     def add(self, states: States) -> Ints:
-        """The nodes int64 [B] of states int64 [B, F]; new ones where they were never met."""
+        """The nodes int64 [B] of states int64 [B, F], added if they are new."""
         nodes, known = np.empty(len(states), dtype=np.int64), self._nodes
         for b, row in enumerate(np.ascontiguousarray(states, dtype=np.int64)):
             nodes[b] = known.setdefault(row.tobytes(), len(known) + 1)
@@ -83,11 +83,11 @@ class VisitTable:
         return nodes
 
     def begin(self, nodes: Ints) -> None:
-        """Episodes began at these nodes [B]."""
+        """Records starts of episodes at these nodes [B]."""
         self._count(np.full(len(nodes), START_NODE), np.zeros(len(nodes), dtype=np.int64), nodes)
 
     def record(self, nodes: Ints, actions: Actions, targets: Ints) -> None:
-        """Actions [B] taken at nodes [B] led to others [B]; to START_NODE where the episode ended."""
+        """Records that actions [B] taken at nodes [B] led to ``targets`` [B], which are START_NODE if the episode ended."""
         self._count(nodes, actions, targets)
 
     def _count(self, nodes: Ints, actions: Actions, targets: Ints) -> None:
@@ -96,28 +96,30 @@ class VisitTable:
         _record(self._arrays, nodes, actions, targets)
 
     def _grow(self, n_nodes: int, n_outcomes: int) -> None:
-        """Makes room for so many nodes and outcomes, at least."""
+        """Reserves memory for at least ``n_nodes`` nodes and ``n_outcomes`` outcomes."""
         old = self._arrays
         self._arrays = _room(self.n_actions, max(n_nodes, len(old.worth)), max(n_outcomes, len(old.target)))
         for before, after in zip(old, self._arrays, strict=True):
             after[: len(before)] = before
 
     def counts(self, states: States) -> Ints:
-        """How often each action was taken in states [B, F], int64 [B, A]."""
+        """Visit count of each action in states [B, F], int64 [B, A]."""
         keys = [row.tobytes() for row in np.ascontiguousarray(states, dtype=np.int64)]
         found = np.array([self._nodes.get(key, -1) for key in keys], dtype=np.int64)
         return np.where(found[:, None] >= 0, self._arrays.tried[found], 0)
 
     def pairs(self) -> int:
-        """Number of distinct (state, action) that were tried."""
+        """Number of distinct (state, action) pairs that were tried."""
         return int((self._arrays.tried[1 : len(self) + 1] > 0).sum())
 
     def choose(self, nodes: Ints, noise: Floats) -> Actions:
-        """The actions int64 [B] of most worth, after value iteration went on a little; rows at the same node share them out.
+        """Actions int64 [B] of the highest value, after some updates of value iteration.
+
+        Rows at the same node distribute over its actions, since an action chosen for one row counts as tried for later rows.
 
         Args:
             nodes: int64 [B].
-            noise: float64 [B, A], uniform in [0, 1), to choose between equals.
+            noise: float64 [B, A], uniform in [0, 1), for breaking ties.
         """
         actions = np.empty(len(nodes), dtype=np.int64)
         self._at, self._upwards = _choose(self._arrays, nodes, noise, self._at, self._upwards, actions)
@@ -139,7 +141,7 @@ def _room(n_actions: int, n_nodes: int, n_outcomes: int) -> VisitArrays:
 
 @compiled
 def _record(table: VisitArrays, nodes: Ints, actions: Actions, targets: Ints) -> None:
-    """Counts an outcome of each row; there must be room."""
+    """Counts an outcome of each row; the arrays must have spare capacity."""
     for b in range(len(nodes)):
         node, a = nodes[b], actions[b]
         table.tried[node, a] += 1
@@ -159,7 +161,7 @@ def _record(table: VisitArrays, nodes: Ints, actions: Actions, targets: Ints) ->
 
 @compiled
 def _mean(table: VisitArrays, node: int, action: int) -> tuple[float, int]:
-    """Mean worth of what an action that was tried led to, and the number of its distinct outcomes."""
+    """Mean value of the observed outcomes of an action that was tried, and the number of distinct ones."""
     total, counted, outcome = 0.0, 0, table.first[node, action]
     while outcome >= 0:
         total += table.times[outcome] * table.worth[table.target[outcome]]
@@ -170,7 +172,7 @@ def _mean(table: VisitArrays, node: int, action: int) -> tuple[float, int]:
 
 @compiled
 def _improve(table: VisitArrays, work: int, at: int, upwards: bool) -> tuple[int, bool]:
-    """Sweeps to and fro over the nodes, in place, from node ``at`` on; returns where to go on."""
+    """Sweeps up and down over the nodes in turn, in place, from node ``at`` on; returns node and direction to continue with."""
     n = table.sizes[0]
     for _ in range(2 * n):
         if at == START_NODE:
@@ -199,7 +201,7 @@ def _improve(table: VisitArrays, work: int, at: int, upwards: bool) -> tuple[int
 
 @compiled
 def _choose(table: VisitArrays, nodes: Ints, noise: Floats, at: int, upwards: bool, actions: Actions) -> tuple[int, bool]:
-    """Fills ``actions`` [B], see VisitTable.choose; each counts as a try for the rows after it. Returns as _improve does."""
+    """Fills ``actions`` [B], see VisitTable.choose; each counts as tried for later rows. Returns as _improve does."""
     at, upwards = _improve(table, WORK, at, upwards)
     for b in range(len(nodes)):
         best = -np.inf

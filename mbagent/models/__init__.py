@@ -1,4 +1,4 @@
-"""Transition models: the paper's predictor and conditioner, tables, and the true simulator behind one protocol."""
+"""Transition models behind one protocol: decision graphs, the paper's networks, tables of counts, and simulators."""
 
 from mbagent.models.base import BaseTransitionModel, FitReport
 from mbagent.models.neural.model import NeuralTransitionModel

@@ -1,4 +1,4 @@
-"""The parts that every model shares: successors and moments from samples (paper section 2), and models with known rules."""
+"""Base classes of models: successors and moments from samples (paper section 2), and models of known rules."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mbagent_envs.random_keys import derive
 
 
 class BaseTransitionModel(ABC):
-    """What every model can do once it can sample.
+    """Methods that every model has if it can sample.
 
     Args:
         cardinalities: number of values of each state factor, length F.
@@ -55,16 +55,15 @@ class BaseTransitionModel(ABC):
         raise NotImplementedError(f"{type(self).__name__} can sample, but has no exact probabilities.")
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
-        """Next states worth planning for: ``n_samples`` draws a row, equal ones merged.
+        """Successors for planning: ``n_samples`` samples for each row, equal ones merged.
 
-        All rows share their random numbers, so that two actions, or two states, differ by their effects and not by
-        luck.
+        All rows share their random numbers, so that actions and states differ only by their effects.
 
         Args:
             states: int64 [B, F].
             actions: int64 [B].
-            n_samples: draws for each row.
-            seed: which random numbers.
+            n_samples: number of samples for each row.
+            seed: of the random numbers.
         """
         keys = derive(seed, np.arange(n_samples))
         rows = np.repeat(np.arange(len(states)), n_samples)
@@ -72,7 +71,7 @@ class BaseTransitionModel(ABC):
         return merge_draws(rows, len(states), next_states, terminated, np.full(len(rows), 1.0 / n_samples))
 
     def reachable_mdp(self, start: States, max_states: int = 10_000, n_samples: int = 32, seed: int = 0) -> ReachableMDP:
-        """The finite-state machine reachable from ``start`` int64 [B, F]; see ``reachable.reachable_mdp``."""
+        """The MDP reachable from ``start`` int64 [B, F]; see ``mdp.reachable_mdp``."""
         return reachable_mdp(self, start, max_states, n_samples, seed)
 
     def moments(
@@ -89,17 +88,17 @@ class BaseTransitionModel(ABC):
             states: int64 [B, F].
             actions: int64 [B].
             of: function of next states [N, F] to floats [N, ...]; None for the factors themselves.
-            n_samples: draws for each row, at least 2.
-            seed: which random numbers.
+            n_samples: number of samples for each row, at least 2.
+            seed: of the random numbers.
 
         Raises:
-            ValueError: fewer draws, which have no variance.
+            ValueError: there are fewer samples, which have no variance.
 
         Returns:
             (mean [B, ...], variance [B, ...]), the unbiased sample moments.
         """
         if n_samples < 2:
-            raise ValueError(f"Moments need at least 2 draws a row to have a variance, got n_samples={n_samples}.")
+            raise ValueError(f"Moments need at least 2 draws for each row to have a variance, got n_samples={n_samples}.")
         rows = np.repeat(np.arange(len(states)), n_samples)
         keys = derive(seed, np.arange(len(rows)))
         next_states, _ = self.sample(states[rows], actions[rows], keys)
@@ -122,10 +121,10 @@ class ExactModel(BaseTransitionModel):
         return {}
 
     def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Takes the empty mapping.
+        """Accepts an empty mapping only.
 
         Raises:
-            ValueError: there are weights in it.
+            ValueError: the mapping contains weights.
         """
         if state:
             raise ValueError(f"A model of known rules has no weights, but was given {sorted(state)[0]!r} and perhaps more.")

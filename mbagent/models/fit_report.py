@@ -1,4 +1,4 @@
-"""What a fit did, and how far it can be trusted: held-out figures for each variable, and what it was found to hang on."""
+"""Report of a fit: held-out scores, calibration and parents of each variable."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from mbagent.data import TransitionBatch
 from mbagent.types import Floats
 
 BINS = 10
-"""Bins of predicted probabilities that are held against frequencies."""
+"""Number of bins of predicted probabilities for the calibration error."""
 
 
 @dataclass(frozen=True)
 class VariableReport:
-    """How well one variable is predicted: a factor, a group of bits of which one is on, or a channel of planes.
+    """Quality of the predictions of one variable: a factor, a mutex group of bits, or a channel of planes.
 
     Attributes:
-        name: what it is called.
-        factors: its factors.
-        log_likelihood: mean held-out log-probability of its factors' next values, each for itself, nats a transition.
+        name: of the variable.
+        factors: indices of its factors.
+        log_likelihood: sum over its factors of the mean held-out log-probability of the next value, nats per transition.
         calibration: mean distance of predicted probabilities from frequencies, 0 ... 1 (expected calibration error).
-        parents: what its next value was found to hang on besides itself.
+        parents: variables other than itself, and the action, on which its next value depends in the model.
     """
 
     name: str
@@ -36,21 +36,21 @@ class VariableReport:
 
 @dataclass(frozen=True)
 class FitReport:
-    """What a fit did.
+    """Report of a fit.
 
     Attributes:
-        n_train: rows fitted to.
-        n_validation: rows held out, by whole episodes.
+        n_train: number of rows used for the fit.
+        n_validation: number of held-out rows, in whole episodes.
         epochs: passes over the data before early stopping.
         seconds: wall time.
-        predictor_loss: held-out cross-entropy of the predictor, nats a transition (None: the model has no predictor).
-        conditioner_loss: the same of the conditioner given the true other variables (None: none).
-        exact_match: share of held-out transitions whose most likely next state is the one met.
+        predictor_loss: held-out cross-entropy of the predictor, nats per transition (None: the model has no predictor).
+        conditioner_loss: the same of the conditioner given the true other variables (None: no conditioner).
+        exact_match: share of held-out transitions whose most likely next state is the observed one.
         log: further figures, for the logger.
-        variables: of each variable that ever changed; empty where the model does not tell.
+        variables: reports of the variables that changed in the data; empty if the model has no such reports.
         calibration: mean distance of all predicted probabilities from frequencies; None likewise.
-        memory: what the step before tells beyond the present state and action, nats a transition; 0 where no more than chance
-            would, None where it was not looked at.
+        memory: improvement of predictions given the previous step in addition to current state and action, nats per transition;
+            0 if it is not significant, None if it was not tested.
     """
 
     n_train: int
@@ -67,18 +67,18 @@ class FitReport:
 
     @property
     def advice(self) -> str | None:
-        """What to do about the environment, in one sentence; None where there is nothing to say."""
+        """Advice on the environment, in one sentence; None if there is none."""
         if not self.memory:
             return None
         return (
-            f"The step before tells the model {self.memory:.2g} nats a transition more than the observation and the action do: "
-            "the next state seems to hang on more than these; wrap the environment in mbagent.wrappers.History(env, k)."
+            f"The previous step improves predictions by {self.memory:.2g} nats per transition, so the next state seems to depend "
+            "on more than the observation and the action; wrap the environment in mbagent.wrappers.History(env, k)."
         )
 
     def table(self, most: int = 20) -> str:
-        """The variables that are predicted worst, as text."""
+        """The variables with the lowest log-likelihood, as text."""
         worst = sorted(self.variables, key=lambda variable: variable.log_likelihood)[:most]
-        lines = [f"{'variable':24} {'log-likelihood':>14} {'calibration':>11}  hangs on"]
+        lines = [f"{'variable':24} {'log-likelihood':>14} {'calibration':>11}  depends on"]
         for variable in worst:
             parents = ", ".join(variable.parents[:8]) + (", …" if len(variable.parents) > 8 else "")
             figures = f"{variable.log_likelihood:14.4f} {variable.calibration:11.4f}"
@@ -90,13 +90,13 @@ def calibration_error(probabilities: Floats, came: NDArray[np.bool_]) -> float:
     """Mean distance of predicted probabilities from the frequencies of their bins (Naeini et al. 2015); both of any shape."""
     bins = np.minimum((probabilities.ravel() * BINS).astype(np.int64), BINS - 1)
     predicted = np.bincount(bins, weights=probabilities.ravel(), minlength=BINS)
-    met = np.bincount(bins, weights=came.ravel().astype(np.float64), minlength=BINS)
-    return float(np.abs(predicted - met).sum() / max(probabilities.size, 1))
+    observed = np.bincount(bins, weights=came.ravel().astype(np.float64), minlength=BINS)
+    return float(np.abs(predicted - observed).sum() / max(probabilities.size, 1))
 
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable that is to be reported: its name, its factors, and what it hangs on."""
+    """A variable to report: its name, factors and parents."""
 
     name: str
     factors: tuple[int, ...]
@@ -112,19 +112,19 @@ def describe(
         cardinalities: number of values of each factor, length F.
         probabilities: each factor's distribution, [N, sum of cardinalities].
         rows: the N held-out transitions.
-        variables: what to report.
+        variables: the variables to report.
     """
     if len(rows) == 0:
         return (), None
     start = np.concatenate([[0], np.cumsum(cardinalities)]).astype(np.int64)
     at = start[:-1] + rows.after
     logs = np.log(np.take_along_axis(probabilities, at, axis=1).clip(1e-12)).mean(axis=0)
-    came = np.zeros(probabilities.shape, dtype=np.bool_)
-    np.put_along_axis(came, at, True, axis=1)
+    observed = np.zeros(probabilities.shape, dtype=np.bool_)
+    np.put_along_axis(observed, at, True, axis=1)
     reports = []
     for variable in variables:
         columns = np.concatenate([np.arange(start[f], start[f + 1]) for f in variable.factors])
-        error = calibration_error(probabilities[:, columns], came[:, columns])
+        error = calibration_error(probabilities[:, columns], observed[:, columns])
         total = float(logs[list(variable.factors)].sum())
         reports.append(VariableReport(variable.name, variable.factors, total, error, variable.parents))
-    return tuple(reports), calibration_error(probabilities, came)
+    return tuple(reports), calibration_error(probabilities, observed)

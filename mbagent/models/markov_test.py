@@ -1,6 +1,6 @@
-"""Whether the next state hangs on more than the present one and the action: does the step before tell anything more?
+"""Markov test: does the previous step improve predictions given the current state and action?
 
-If it does, the observation is not the whole state, and ``mbagent.wrappers.History`` makes the past part of it.
+If it does, the observation is not the whole state, and ``mbagent.wrappers.History`` adds the past to it.
 """
 
 from __future__ import annotations
@@ -14,11 +14,14 @@ from mbagent.models.dbn.features import ActionEncoding, action_feature_table
 from mbagent.spaces import FactoredSpace, PlaneLayout
 
 PART = 2000
-"""Transitions looked at at once."""
+"""Number of transitions that are compared at once."""
 
 
 def following_steps(rows: TransitionBatch) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Numbers of the transitions that follow another in the same episode, and of those; episodes may be interleaved."""
+    """Indices of the transitions that follow another one in the same episode, and of their predecessors.
+
+    Episodes may be interleaved.
+    """
     order = np.argsort(rows.episodes, kind="stable")
     earlier, later = order[:-1], order[1:]
     same = (rows.episodes[later] == rows.episodes[earlier]) & _follow(rows, later, earlier)
@@ -26,7 +29,7 @@ def following_steps(rows: TransitionBatch) -> tuple[NDArray[np.int64], NDArray[n
 
 
 def _follow(rows: TransitionBatch, later: NDArray[np.int64], earlier: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which of the later transitions begin where the earlier ones end; looked at in parts."""
+    """Which of the later transitions begin in the state where the earlier ones end; compared in parts to limit memory."""
     found = np.zeros(len(later), dtype=np.bool_)
     for begin in range(0, len(later), PART):
         part = slice(begin, begin + PART)
@@ -35,7 +38,7 @@ def _follow(rows: TransitionBatch, later: NDArray[np.int64], earlier: NDArray[np
 
 
 def steps_in_a_row(rows: TransitionBatch, most: int) -> tuple[TransitionBatch, TransitionBatch]:
-    """Evenly chosen transitions that follow another, and those that they follow."""
+    """At most ``most`` evenly spaced transitions that follow another one, and their predecessors."""
     later, earlier = following_steps(rows)
     some = np.linspace(0, len(later) - 1, min(len(later), most)).astype(np.int64) if len(later) else later
     return rows.select(later[some]), rows.select(earlier[some])
@@ -48,32 +51,32 @@ def with_past(
     encoding: ActionEncoding,
     board: PlaneLayout | None,
 ) -> tuple[FactoredSpace, TransitionBatch]:
-    """Transitions that follow others, with the others' states and actions as part of their state.
+    """Transitions whose states include the state and action of their predecessors.
 
     Args:
         now: the transitions.
-        before: those that they follow.
+        before: their predecessors.
         cardinalities: number of values of each factor.
-        encoding: the actions.
-        board: where the factors are cells of planes; the past is further planes then.
+        encoding: of the actions.
+        board: layout of the factors if they form planes, so that the past is added as further planes; else None.
 
     Returns:
         (the space of states with a past, the transitions).
     """
     shape: tuple[int, ...] = (len(cardinalities),) if board is None else (board.channels, board.height, board.width)
 
-    def laid_out(states: NDArray[np.int64]) -> NDArray[np.int64]:
+    def arranged(states: NDArray[np.int64]) -> NDArray[np.int64]:
         return states if board is None else board.to_planes(states)
 
-    def shown(states: NDArray[np.int64], past: NDArray[np.int64], actions: NDArray[np.int64]) -> NDArray[np.int64]:
+    def with_history(states: NDArray[np.int64], past: NDArray[np.int64], actions: NDArray[np.int64]) -> NDArray[np.int64]:
         bits = action_feature_table(encoding, actions).astype(np.int64)
         bits = bits if board is None else np.broadcast_to(bits[:, :, None, None], (*bits.shape, *shape[1:]))
-        return np.concatenate([laid_out(states), laid_out(past), bits], axis=1)
+        return np.concatenate([arranged(states), arranged(past), bits], axis=1)
 
-    cards = laid_out(np.asarray(cardinalities)[None])[0]
+    cards = arranged(np.asarray(cardinalities)[None])[0]
     twos = np.full((encoding.n_features, *shape[1:]), 2)
     sizes = np.concatenate([cards, cards, twos])
     space = FactoredSpace(spaces.MultiBinary(sizes.shape) if (sizes == 2).all() else spaces.MultiDiscrete(sizes))
-    states = space.encode(shown(now.states, before.states, before.actions))
-    following = space.encode(shown(now.next_states, now.states, now.actions))
+    states = space.encode(with_history(now.states, before.states, before.actions))
+    following = space.encode(with_history(now.next_states, now.states, now.actions))
     return space, TransitionBatch(states, now.actions, following, now.terminated, now.rewards, now.episodes)

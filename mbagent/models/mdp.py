@@ -1,6 +1,6 @@
 """The graph of expanded states, and the MDP of all states that a model can reach (paper section 2).
 
-The reachable MDP and the search tree are both such graphs: a state reached in two ways is one node. Nodes belong to *groups*: no
+The reachable MDP and the search tree are both such graphs: a state reached on two paths is one node. Nodes belong to *groups*: no
 edge leads from one group to another, so that the plan for one observation cannot depend on the others of its batch.
 """
 
@@ -20,18 +20,18 @@ from mbagent_envs.jit import borrowed, compiled
 from mbagent_envs.random_keys import derive, mix
 
 FEWEST_SLOTS = 1024
-"""Places of the smallest hash table."""
+"""Number of slots of the smallest hash table."""
 
 NODES_AT_ONCE = 16_384
-"""Successors that room is made for at once, unless one state may have more; a node takes 16 bytes for each action."""
+"""Number of successors for which memory is reserved at once, unless one state may have more; 16 bytes per node and action."""
 
 
 class GraphArrays(NamedTuple):
-    """What compiled kernels need of a graph, with room to grow; N nodes and M edges of them are in use.
+    """The arrays of a graph for compiled kernels, with spare capacity; N nodes and M edges are in use.
 
     Attributes:
         states, groups, expanded, first, counts, left_out: see StateGraph, [room, ...].
-        reached: whether a node was reached by a transition that did not end the episode, bool [room].
+        reached: whether a transition that does not end the episode leads to the node, bool [room].
         tags: hash of each node's state and group, uint64 [room].
         next_nodes, probabilities, terminated, sources, actions: see StateGraph, [room].
         slots: hash table of the nodes, -1 where free, int64 [a power of two].
@@ -59,7 +59,7 @@ class GraphArrays(NamedTuple):
 
 @compiled
 def add_node(graph: GraphArrays, state: Ints, group: int) -> int:
-    """The node of a state [F] in a group; a new one where there is none. There must be room."""
+    """The node of a state [F] in a group, added if it does not exist. The arrays must have spare capacity."""
     total = np.uint64(0)
     for f in range(len(state)):
         total += np.uint64(state[f] + 1) * graph.weights[f]
@@ -84,7 +84,7 @@ def add_node(graph: GraphArrays, state: Ints, group: int) -> int:
 
 @compiled
 def add_edge(graph: GraphArrays, source: int, action: int, state: Ints, terminated: bool, probability: float) -> int:
-    """Appends a successor of a (node, action), whose others were the last to be appended; returns its node."""
+    """Appends a successor of a (node, action) and returns its node; all successors of the pair must be appended in sequence."""
     target, edge = add_node(graph, state, graph.groups[source]), graph.sizes[1]
     graph.next_nodes[edge], graph.probabilities[edge], graph.terminated[edge] = target, probability, terminated
     graph.sources[edge], graph.actions[edge] = source, action
@@ -100,7 +100,7 @@ def add_edge(graph: GraphArrays, source: int, action: int, state: Ints, terminat
 def expand_with(
     kernel: Any, work: Any, graph: GraphArrays, node: int, n_samples: int, key: np.uint64, offset: float, out: Outcomes
 ) -> None:
-    """Appends all successors of a node, from a kernel."""
+    """Appends all successors of a node, as listed by a kernel."""
     outcomes(kernel, work, graph.states[node], n_samples, key, offset, out)
     i = 0
     for action in range(len(out.counts)):
@@ -113,13 +113,13 @@ def expand_with(
 
 @compiled
 def most_outcomes(n_actions: int, n_samples: int) -> int:
-    """Outcomes that a state may have at most; see ``compiled_model.outcomes``."""
+    """Maximum number of outcomes of a state; see ``overloads.outcomes``."""
     return 2 * n_actions * max(n_samples, 2)
 
 
 @compiled
 def room_for_outcomes(n_actions: int, n_factors: int, n_samples: int) -> Outcomes:
-    """Room for all that may follow a state."""
+    """Arrays for all outcomes of a state."""
     most = most_outcomes(n_actions, n_samples)
     return Outcomes(
         np.empty(n_actions, dtype=np.int64),
@@ -132,22 +132,22 @@ def room_for_outcomes(n_actions: int, n_factors: int, n_samples: int) -> Outcome
 
 @compiled
 def _expand_all(kernel: Any, graph: GraphArrays, nodes: Ints, n_samples: int, key: np.uint64, offset: float) -> int:
-    """Expands nodes [B] as long as there is room; returns how many."""
+    """Expands nodes [B] as long as the arrays have capacity; returns the number of expanded nodes."""
     n_actions, most = graph.counts.shape[1], most_outcomes(graph.counts.shape[1], n_samples)
     made = work_for(kernel, n_samples), room_for_outcomes(n_actions, graph.states.shape[1], n_samples)
-    lent, kernel, graph = borrowed(made), borrowed(kernel), borrowed(graph)
+    work_out, kernel, graph = borrowed(made), borrowed(kernel), borrowed(graph)
     done = 0
     for node in nodes:
         if graph.sizes[0] + most > len(graph.states) or graph.sizes[1] + most > len(graph.sources):
             break
-        expand_with(kernel, lent[0], graph, node, n_samples, key, offset, lent[1])
+        expand_with(kernel, work_out[0], graph, node, n_samples, key, offset, work_out[1])
         done += 1
-    return done + 0 * len(made[1].counts)  # what is lent must live until here
+    return done + 0 * len(made[1].counts)  # the borrowed arrays must live until here
 
 
 @compiled
 def _append(graph: GraphArrays, nodes: Ints, offsets: Ints, states: States, terminated: Bools, probabilities: Floats) -> None:
-    """Appends successors that a model found: those of nodes[i] under action a are row i * A + a of the compressed rows."""
+    """Appends successors listed by a model: those of nodes[i] under action a are row i * A + a of the compressed rows."""
     n_actions = graph.counts.shape[1]
     for i in range(len(nodes)):
         for a in range(n_actions):
@@ -196,20 +196,20 @@ _EDGE_FIELDS = ("next_nodes", "probabilities", "terminated", "sources", "actions
 class StateGraph:
     """States, and for every expanded (state, action) its successors.
 
-    Shapes: N nodes, A actions, F factors, M successors in all. The successors of node i under action a lie at
-    ``first[i, a] : first[i, a] + count[i, a]`` of the successor arrays.
+    Shapes: N nodes, A actions, F factors, M successors in all. The successors of node i under action a are at
+    ``first[i, a] : first[i, a] + counts[i, a]`` of the successor arrays.
 
     Args:
-        model: where successors come from.
+        model: transition model that lists the successors.
 
-    Attributes (arrays are views of what is filled so far):
+    Attributes (arrays are views of the part in use):
         states: int64 [N, F]. groups: int64 [N]. expanded: bool [N].
         first, counts: int64 [N, A].
-        left_out: float64 [N, A], probability of rare successors that others stand for, see ``particles.py``.
+        left_out: float64 [N, A], probability of rare successors that were merged with others, see ``systematic_sampling.py``.
         next_nodes: int64 [M]. probabilities: float64 [M]. terminated: bool [M].
-        sources: int64 [M], the node each successor comes from. actions: int64 [M].
-        arrays: the same for compiled kernels, with room to grow.
-        kernel: the model's arrays for compiled kernels; None where it has none.
+        sources: int64 [M], the node of which each entry is a successor. actions: int64 [M].
+        arrays: the same for compiled kernels, with spare capacity.
+        kernel: the model's arrays for compiled kernels; None if it has none.
     """
 
     def __init__(self, model: TransitionModel) -> None:
@@ -238,7 +238,7 @@ class StateGraph:
         return int(self.arrays.sizes[1])
 
     def __getattr__(self, name: str) -> NDArray[Any]:
-        """Views of the arrays that are filled so far."""
+        """Views of the parts of the arrays that are in use."""
         if name in _NODE_FIELDS or name in _EDGE_FIELDS:
             array: NDArray[Any] = getattr(self.arrays, name)
             return array[: self.arrays.sizes[0 if name in _NODE_FIELDS else 1]]
@@ -257,12 +257,12 @@ class StateGraph:
     actions: Ints
 
     def clear(self) -> None:
-        """Forgets all states; the room stays."""
+        """Removes all states; the memory is kept."""
         self.arrays.slots.fill(-1)
         self.arrays.sizes.fill(0)
 
     def reserve(self, n_nodes: int, n_edges: int) -> None:
-        """Makes room for so many more nodes and edges."""
+        """Reserves memory for ``n_nodes`` further nodes and ``n_edges`` further edges."""
         arrays = self.arrays
         for extra, fields, used in ((n_nodes, _NODE_FIELDS, len(self)), (n_edges, _EDGE_FIELDS, self.n_edges)):
             old = len(getattr(arrays, fields[0]))
@@ -283,16 +283,16 @@ class StateGraph:
         return nodes
 
     def find(self, states: States, group: int = 0) -> Ints:
-        """Nodes [B] of states [B, F] in one group, -1 where there is none."""
+        """Nodes [B] of states [B, F] in one group; -1 for states that are not in it."""
         nodes = np.empty(len(states), dtype=np.int64)
         _find_all(self.arrays, np.ascontiguousarray(states, dtype=np.int64), group, nodes)
         return nodes
 
     def expand(self, nodes: Ints, n_samples: int, seed: int) -> Ints:
-        """Asks the model for the successors of unexpanded, distinct ``nodes`` [B] under every action.
+        """Adds the model's successors of unexpanded, distinct ``nodes`` [B] under every action.
 
         Returns:
-            the nodes that were new, in order of appearance, int64.
+            the new nodes, in order of appearance, int64.
         """
         size = len(self)
         if self.kernel is not None:
@@ -314,13 +314,13 @@ class StateGraph:
         _append(self.arrays, nodes, found.offsets, states, found.terminated, found.probabilities)
 
     def only_terminal(self, nodes: Ints) -> Bools:
-        """Whether each of the ``nodes`` [B] was reached by terminated transitions only: nothing comes after it."""
+        """Whether each of the ``nodes`` [B] is reached by terminated transitions only, so that no state follows it."""
         result: Bools = ~self.arrays.reached[nodes]
         return result
 
 
 def _longer(array: NDArray[Any], used: int, size: int) -> NDArray[Any]:
-    """The first ``used`` rows, with room for ``size``: what was never written takes no memory yet."""
+    """A copy of the first ``used`` rows with capacity for ``size``; rows never written do not occupy memory yet."""
     longer = np.empty((size, *array.shape[1:]), dtype=array.dtype)
     longer[:used] = array[:used]
     return longer
@@ -336,8 +336,8 @@ class ReachableMDP:
         next_states: int64 [M], indices of states.
         probabilities: float64 [M].
         terminated: bool [M].
-        complete: whether every reachable state was expanded within the budget. If not, the machine is partial: states
-            that were met but not expanded have no successors.
+        complete: whether every reachable state was expanded within the budget. If not, the MDP is partial: states that were
+            reached but not expanded have no successors.
     """
 
     states: States
@@ -349,7 +349,7 @@ class ReachableMDP:
 
 
 MOST_ROOM = 100_000_000
-"""Entries of a graph's tables of (state, action) that the outcomes of one state may make room for, 16 bytes each."""
+"""Maximum number of (state, action) entries, 16 bytes each, that may be reserved for the outcomes of one state."""
 
 
 def grow_reachable(
@@ -358,12 +358,12 @@ def grow_reachable(
     """Expands states breadth-first from ``start`` until none is left or ``max_states`` are expanded.
 
     Args:
-        model: the model to imagine with.
+        model: transition model.
         start: int64 [B, F].
-        max_states: number of states expanded at most.
-        n_samples: draws for a (state, action) with too many successors to enumerate; fewer where there are so many actions
-            that room for their outcomes would be too large.
-        seed: which random numbers those draws use.
+        max_states: maximum number of expanded states.
+        n_samples: samples for a (state, action) with too many successors to enumerate; fewer if there are so many actions that
+            their outcomes would take too much memory (MOST_ROOM).
+        seed: of the random numbers of these samples.
 
     Returns:
         (graph with one group 0, whether every reachable state was expanded).
@@ -386,16 +386,16 @@ def grow_reachable(
 def reachable_mdp(
     model: TransitionModel, start: States, max_states: int = 10_000, n_samples: int = 32, seed: int = 0
 ) -> ReachableMDP:
-    """The machine reachable from ``start`` int64 [B, F], as plain arrays; see ``grow_reachable`` for the arguments.
+    """The MDP reachable from ``start`` int64 [B, F], as plain arrays; see ``grow_reachable`` for the arguments.
 
-    Where more than ``max_states`` states can be reached, the nearest ones are expanded and ``complete`` is False.
+    If more than ``max_states`` states can be reached, the nearest ones are expanded and ``complete`` is False.
 
     Raises:
-        ValueError: a budget of no states or no draws, or no start state.
+        ValueError: ``max_states`` or ``n_samples`` is below 1, or there is no start state.
     """
     for name, value in (("max_states", max_states), ("n_samples", n_samples), ("the number of start states", len(start))):
         if value < 1:
-            raise ValueError(f"A machine needs at least one of each, but {name} is {value}; give 1 or more.")
+            raise ValueError(f"A reachable MDP needs a state, a sample and a start state, but {name} is {value}; give 1 or more.")
     graph, complete = grow_reachable(model, start, max_states, n_samples, seed)
     order = np.lexsort((graph.actions, graph.sources))
     counts = graph.counts

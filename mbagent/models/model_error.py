@@ -1,8 +1,8 @@
-"""How far a model can be trusted: the probability that what it foretells is wrong (the paper's section 6, model error).
+"""Model error: calibrated probability that a model's most likely prediction is wrong (the paper's section 6).
 
-A model knows how random the world is, not how wrong it may be itself. Models learned without one part of the episodes or
-another disagree where there is little to go by (the jackknife); how often predictions with so much doubt were wrong
-on episodes held out, each part in turn, makes an honest probability of it (isotonic regression; Zadrozny and Elkan 2002).
+A model estimates how random the environment is, but not its own error. Models fitted without different parts of the episodes
+disagree where data are scarce (the jackknife). The frequency of wrong predictions on held-out parts, as a function of the error
+that these models predict on average, is the calibrated probability (isotonic regression; Zadrozny and Elkan 2002).
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from mbagent.models.protocol import TransitionModel
 from mbagent.types import Actions, Bools, Floats, Ints, States
 
 BELIEVED = 20.0
-"""Held-out transitions that a doubt counts for as it stands."""
+"""Weight of the uncalibrated doubts in the calibration, in held-out transitions."""
 
 
-_AS_IT_STANDS = np.array([0.0, 1.0]), np.array([0.0, 1.0])
+_IDENTITY = np.array([0.0, 1.0]), np.array([0.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class ModelError:
 
     Attributes:
         model: the model.
-        members: models of its data without one part or another.
-        doubts: doubts with known errors, ascending, [K].
-        rates: how often predictions with such a doubt are wrong, [K].
+        members: models fitted to its data without one part each.
+        doubts: doubts at the points of the calibration curve, ascending, [K].
+        rates: frequency of wrong predictions at these doubts, [K].
     """
 
     model: TransitionModel
@@ -42,18 +42,18 @@ class ModelError:
     rates: Floats
 
     def __call__(self, states: States, actions: Actions) -> Floats:
-        """Probability that the likeliest next state is not what comes, by chance or by error, [B]."""
+        """Probability that the next state is not the model's likeliest one, by chance or by model error, [B]."""
         return np.interp(self.doubt(states, actions), self.doubts, self.rates)
 
     def doubt(self, states: States, actions: Actions) -> Floats:
-        """Probability of anything else than the model's likeliest outcome, mean over the model and all members, [B]."""
+        """Probability of all outcomes but the model's likeliest one, averaged over the model and all members, [B]."""
         following, ends = likeliest(self.model, states, actions)
         logs = [model.log_prob(states, actions, following, ends) for model in (self.model, *self.members)]
         result: Floats = 1.0 - np.exp(logs).mean(axis=0)
         return result.clip(0.0, 1.0)
 
     def disagreement(self, states: States, actions: Actions) -> Floats:
-        """Standard deviation, over the models, of the probability of the likeliest outcome, [B]: what more data would settle."""
+        """Standard deviation, over the models, of the probability of the likeliest outcome, [B]; more data would reduce it."""
         following, ends = likeliest(self.model, states, actions)
         logs = [model.log_prob(states, actions, following, ends) for model in (self.model, *self.members)]
         result: Floats = np.exp(logs).std(axis=0)
@@ -68,14 +68,15 @@ def estimate_error(
     n_members: int = 5,
     seed: int = 0,
 ) -> ModelError:
-    """Learns how wrong a model may be.
+    """Estimates the error of a model.
 
     Args:
-        build: makes a new model of its kind.
+        build: creates an unfitted model of the same kind.
         model: the model, fitted to ``data``; it needs exact probabilities.
-        data: what it was fitted to.
-        n_members: models to hold beside it, each fitted to all but one of as many parts of the episodes; one more is fitted
-            for every two parts, without both, to learn how often the members are wrong: 15 fits in all for 5.
+        data: the transitions that it was fitted to.
+        n_members: number of further models to compare with it. The episodes are divided into this many parts, and each member
+            is fitted without one of them. For the calibration, a model is fitted without each pair of parts: 15 fits in all
+            for 5 members.
         seed: of fits and parts.
 
     Raises:
@@ -101,15 +102,15 @@ def estimate_error(
     without = {pair: fitted(~np.isin(part, pair)) for pair in itertools.combinations(range(n_members), 2)}
     doubts, wrong = [], []
     for number, member in enumerate(members):
-        fewer = tuple(other for pair, other in without.items() if number in pair)
+        others = tuple(other for pair, other in without.items() if number in pair)
         held_out = rows.select(part == number)
-        doubts.append(ModelError(member, fewer, *_AS_IT_STANDS).doubt(held_out.states, held_out.actions))
+        doubts.append(ModelError(member, others, *_IDENTITY).doubt(held_out.states, held_out.actions))
         wrong.append(missed(member, held_out))
     return ModelError(model, members, *_calibrated(np.concatenate(doubts), np.concatenate(wrong)))
 
 
 def _check_probabilities(model: TransitionModel, row: TransitionBatch) -> None:
-    """Refuses a model without exact probabilities before anything is fitted.
+    """Checks that a model has exact probabilities, before any fit.
 
     Raises:
         NotImplementedError: it has none.
@@ -124,7 +125,7 @@ def _check_probabilities(model: TransitionModel, row: TransitionBatch) -> None:
 
 
 def parts_of(rows: TransitionBatch, n_parts: int, seed: int) -> Ints:
-    """Which of ``n_parts`` parts each row is in, by whole episodes, int64 [N]; few long episodes are cut into runs first."""
+    """Part of each row, 0 ... n_parts - 1, by whole episodes, int64 [N]; if there are few episodes, by runs of rows instead."""
     groups = np.unique(rows.episodes, return_inverse=True)[1]
     if groups.max() + 1 < 2 * n_parts:
         groups = np.arange(len(rows)) * 2 * n_parts // len(rows)
@@ -134,10 +135,10 @@ def parts_of(rows: TransitionBatch, n_parts: int, seed: int) -> Ints:
 
 
 def likeliest(model: TransitionModel, states: States, actions: Actions) -> tuple[States, Bools]:
-    """A model's likeliest next states, int64 [B, F], and ends, bool [B]: its own word, or each factor's likeliest value."""
-    own = getattr(model, "likeliest", None)
-    if own is not None:
-        found: tuple[States, Bools] = own(states, actions)
+    """Likeliest next states, int64 [B, F], and terminated, bool [B]: by the model's method, or factor by factor."""
+    method = getattr(model, "likeliest", None)
+    if method is not None:
+        found: tuple[States, Bools] = method(states, actions)
         return found
     probs, start = model.marginals(states, actions), np.concatenate([[0], np.cumsum(model.cardinalities)])
     columns = [probs[:, begin:end].argmax(axis=1) for begin, end in itertools.pairwise(start)]
@@ -147,16 +148,16 @@ def likeliest(model: TransitionModel, states: States, actions: Actions) -> tuple
 
 
 def missed(model: TransitionModel, rows: TransitionBatch) -> Bools:
-    """In which rows the likeliest outcome is not what came, bool [N]."""
+    """Rows whose outcome is not the model's likeliest one, bool [N]."""
     following, ends = likeliest(model, rows.states, rows.actions)
     result: Bools = (following != rows.next_states).any(axis=1) | (ends != rows.terminated)
     return result
 
 
 def _calibrated(doubts: Floats, wrong: Bools) -> tuple[Floats, Floats]:
-    """Doubts and how often they were wrong, ascending; with few held-out transitions a doubt is believed as it stands.
+    """Calibration curve: doubts and error rates, both ascending; with few held-out transitions close to the identity.
 
-    Doubts of one rate stand at their mean, so that between them more doubt is more (Oron and Flournoy 2017).
+    Doubts with the same rate are replaced by their mean, so that the curve strictly increases (Oron and Flournoy 2017).
     """
     own = np.quantile(doubts, np.linspace(0.0, 1.0, 11)) if len(doubts) else np.zeros(0)
     x = np.concatenate([doubts, own, [0.0, 1.0]])

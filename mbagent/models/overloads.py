@@ -1,8 +1,7 @@
-"""Models inside compiled search: what a compiled planner asks of a model's arrays.
+"""Models inside compiled search: the functions by which a compiled planner queries a model's arrays.
 
-A model that can be asked from compiled code returns a NamedTuple of arrays from ``kernel()``, and gives the functions
-here an overload for that type of tuple. Calls are resolved when the planner's kernel is compiled, so they cost
-nothing.
+A model that compiled code can query returns a NamedTuple of arrays from ``kernel()``, and registers overloads of the functions
+here for that type of tuple. Calls are resolved when the planner's kernel is compiled, so they have no cost at run time.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ _Kernel = TypeVar("_Kernel", bound=Callable[..., Any])
 
 
 class Outcomes(NamedTuple):
-    """Room for what may follow a state, action after action.
+    """Arrays for the outcomes of a state, action after action.
 
     Attributes:
-        counts: how many outcomes each action has, int64 [A].
+        counts: number of outcomes of each action, int64 [A].
         states: int64 [K, F].
         terminated: bool [K].
         probabilities: [K].
-        left_out: probability of the rare outcomes of each action that others stand for, see ``particles.py``, [A].
+        left_out: probability of each action's rare outcomes that were merged with others, see ``systematic_sampling.py``, [A].
     """
 
     counts: NDArray[np.int64]
@@ -38,43 +37,43 @@ class Outcomes(NamedTuple):
 
 @runtime_checkable
 class CompiledModel(Protocol):
-    """A model that compiled planners can ask."""
+    """A model that compiled planners can query."""
 
     def kernel(self) -> Any:
-        """Its arrays, a NamedTuple that the functions below have overloads for."""
+        """Its arrays, a NamedTuple for whose type the functions below have overloads."""
         ...
 
 
 def work_for(kernel: Any, n_grid: int) -> Any:
-    """Work space for a kernel and at most ``n_grid`` draws at once; made once, used for many states."""
+    """Work arrays for a kernel and at most ``n_grid`` samples, created once and used for many states."""
     raise NotImplementedError
 
 
 def outcomes(kernel: Any, work: Any, state: Any, n_grid: int, key: Any, offset: float, out: Outcomes) -> int:
-    """Writes what may follow a state to ``out``: listed or stratified, as ``TransitionModel.successors``.
+    """Writes the outcomes of a state to ``out``: listed or stratified, as ``TransitionModel.successors``.
 
     Args:
         kernel: the model's arrays.
         work: see ``work_for``.
         state: int64 [F].
-        n_grid: draws for each action, beside strata for what is rare.
-        key: of the draws, as ``particles.start`` makes it of a seed.
+        n_grid: number of samples for each action, in addition to the strata of rare values.
+        key: of the samples, from ``systematic_sampling.start``.
         offset: likewise.
-        out: with room for twice ``n_grid`` outcomes of each action, and four at least.
+        out: with room for twice ``n_grid`` outcomes of each action, and at least four.
 
     Returns:
-        how many there are in all.
+        total number of outcomes.
     """
     raise NotImplementedError
 
 
 def implements(function: Callable[..., Any], kernel_type: type) -> Callable[[_Kernel], _Kernel]:
-    """Makes a compiled function the overload of one of the functions above for a type of kernel."""
+    """Registers a compiled function as the overload of one of the functions above for a type of kernel."""
 
     def register(compiled_function: _Kernel) -> _Kernel:
         names = function.__code__.co_varnames[: function.__code__.co_argcount]
         arguments = ", ".join(names)
-        # numba wants the very argument names of the function that is overloaded
+        # numba requires the same argument names as in the overloaded function
         body = eval(f"lambda {arguments}: call({arguments})", {"call": compiled_function})
 
         def choose(kernel: Any, *rest: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What a model of the environment is: the protocol (paper section 2).
+"""The protocol of transition models (paper section 2).
 
 "A sufficient condition to say an agent has learned an approximate model of its environment is when it can sample from
 a distribution approximately similar to the real transition probability distribution. With this ability it can make
@@ -21,7 +21,7 @@ from mbagent.types import Actions, Bools, Floats, Keys, Randomness, States
 from mbagent_envs.random_keys import derive, hash_rows
 
 LARGEST_NUMBER = 2**62
-"""Actions, and strings of actions that are one action of a model, are numbered up to here."""
+"""Upper bound of the numbers of actions, and of action sequences that are one action of a model."""
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,13 @@ class Successors:
 
     @property
     def rows(self) -> NDArray[np.int64]:
-        """Which row each successor belongs to, int64 [M]."""
+        """Row to which each successor belongs, int64 [M]."""
         return np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
 
 
 @runtime_checkable
 class TransitionModel(Protocol):
-    """A model of P(next state, terminated | state, action) over factored states.
+    """A model of P(next state, terminated | state, action) for factored states.
 
     Shapes: B batch, F factors. Actions are numbers of the enumerated actions.
     """
@@ -57,11 +57,11 @@ class TransitionModel(Protocol):
     n_actions: int
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
-        """Learns from the transitions; rewards are never read. ``progress`` is told the share done, 0 ... 1."""
+        """Fits the model to transitions, without rewards. ``progress`` is called with the share that is done, 0 ... 1."""
         ...
 
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
-        """Draws next_states int64 [B, F] and terminated bool [B]."""
+        """Samples next_states int64 [B, F] and terminated bool [B]."""
         ...
 
     def marginals(self, states: States, actions: Actions) -> Floats:
@@ -69,11 +69,11 @@ class TransitionModel(Protocol):
         ...
 
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
-        """Log-probability [B], exact; a model that has none raises NotImplementedError, saying so."""
+        """Exact log-probability [B]; models without exact probabilities raise NotImplementedError."""
         ...
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
-        """Next states worth planning for: all of them where they are few, else ``n_samples`` draws."""
+        """Successors for planning: all if they are few, else ``n_samples`` samples."""
         ...
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
@@ -81,29 +81,29 @@ class TransitionModel(Protocol):
         ...
 
     def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Takes over what ``state_dict`` returned."""
+        """Restores the weights that ``state_dict`` returned."""
         ...
 
 
 def as_keys(rng: Randomness, n: int) -> Keys:
-    """Keys uint64 [n] from either form of randomness.
+    """Keys uint64 [n] from a generator or from keys.
 
     Raises:
-        ValueError: keys of another length.
+        ValueError: the number of keys is not n.
     """
     if isinstance(rng, np.random.Generator):
         return rng.integers(0, 2**64, size=n, dtype=np.uint64)
     if len(rng) != n:
-        raise ValueError(f"{len(rng)} random keys were given for {n} rows; give one key a row.")
+        raise ValueError(f"{len(rng)} random keys were given for {n} rows; give one key for each row.")
     return rng
 
 
 def merge_draws(rows: NDArray[np.int64], n_rows: int, states: States, terminated: Bools, weights: Floats) -> Successors:
-    """Adds up the weights of equal (row, state, terminated); each row's order is that of the first draw.
+    """Adds up the weights of equal (row, state, terminated); within each row, outcomes keep the order of their first sample.
 
     Args:
-        rows: int64 [M], ascending: which row a draw belongs to.
-        n_rows: number of rows B; each must have a draw.
+        rows: int64 [M], ascending: the row of each sample.
+        n_rows: number of rows B; each must have a sample.
         states: int64 [M, F].
         terminated: bool [M].
         weights: float [M] above zero, normalised here.

@@ -1,4 +1,4 @@
-"""From the name of a model to the model: what the space's structure calls for."""
+"""Registry of models: names that create a model suited to the structure of the space."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ ModelFactory = Callable[[FactoredSpace, int, float], TransitionModel]
 """``factory(space, n_actions, learning_rate) -> model``."""
 
 PLANE_TRAINING = TrainingConfig(batch_size=128, weight_decay=1e-3, epochs=40.0, min_steps=1500, max_steps=4000)
-"""Shared weights see every position in every row, so small batches do; but planning finds and exploits every wrong corner
-of a model, so training goes on for long."""
+"""Shared weights are trained on every position of every row, so small batches suffice; but planning finds and exploits model
+errors, so training is long."""
 
 
 STRING_STEPS = 2000
-"""Most gradient steps for strings of actions on planes: one costs as many layers as there are actions."""
+"""Maximum number of gradient steps for action sequences on planes, where each step needs as many layers as there are actions."""
 
 DIRECT_STEPS = tuple(range(2, 16))
-"""Numbers of steps that the model "direct" learns a network of its own for."""
+"""Numbers of steps for which the model "direct" learns a network each."""
 
 
 def build_networks(space: FactoredSpace, n_actions: int, learning_rate: float) -> BaseTransitionModel:
-    """Weights shared over positions where the observation is a stack of planes, else predictor and causal conditioner."""
+    """Networks: weights shared over positions if observations are stacks of planes, else predictor and causal conditioner."""
     planes = space.planes
     if planes is None:
         training = replace(TrainingConfig(), learning_rate=learning_rate)
@@ -47,7 +47,7 @@ def build_networks(space: FactoredSpace, n_actions: int, learning_rate: float) -
 
 
 def build_string(space: FactoredSpace, n_actions: int, learning_rate: float, n_steps: int) -> NeuralTransitionModel:
-    """A model of states ``n_steps`` apart whose action is a string of as many (paper 4.2)."""
+    """A model of the state after ``n_steps`` steps, given the sequence of their actions as one action (paper 4.2)."""
     planes, cards = space.planes, space.cardinalities
     if planes is None:
         config = NeuralConfig(training=replace(TrainingConfig(), learning_rate=learning_rate))
@@ -66,9 +66,9 @@ def build_string(space: FactoredSpace, n_actions: int, learning_rate: float, n_s
 def build_direct(
     space: FactoredSpace, n_actions: int, learning_rate: float, steps: Sequence[int] | None = None
 ) -> DirectForecastModel:
-    """The model of ``build_networks``, and beside it one model for each of several numbers of steps.
+    """The model of ``build_networks`` and one further model for each number of steps in ``steps``.
 
-    By default ``DIRECT_STEPS``, as far as strings of so many actions can be numbered.
+    By default those of ``DIRECT_STEPS`` for which the action sequences can be numbered.
     """
     if steps is None:
         steps = [n for n in DIRECT_STEPS if n <= longest_string(n_actions)]
@@ -80,7 +80,7 @@ def build_direct(
 
 
 def build_paper(space: FactoredSpace, n_actions: int, learning_rate: float) -> TransitionModel:
-    """Section 3's two networks as they stand, on flat variables."""
+    """The two networks of the paper's section 3, unchanged, on flat variables."""
     config = NeuralConfig.paper(len(space))
     return NeuralTransitionModel(
         space.cardinalities,
@@ -90,7 +90,7 @@ def build_paper(space: FactoredSpace, n_actions: int, learning_rate: float) -> T
 
 
 def build_tabular(space: FactoredSpace, n_actions: int, learning_rate: float) -> TransitionModel:
-    """Counts of what was seen; nothing carries over to unseen states."""
+    """Count model of the observed transitions, without generalisation to unseen states."""
     del learning_rate
     return TabularModel(space.cardinalities, n_actions)
 
@@ -98,7 +98,7 @@ def build_tabular(space: FactoredSpace, n_actions: int, learning_rate: float) ->
 def build_graphs(
     space: FactoredSpace, n_actions: int, learning_rate: float, parts: Sequence[int] | None = None
 ) -> TransitionModel:
-    """Decision graphs over the few things that each variable hangs on; on planes, if they are, the same at every position."""
+    """Decision graphs over each variable's few parents; on planes, parameters are tied over positions if that is better."""
     del learning_rate
     if space.planes is not None and channel_cardinalities(space) is not None:
         return PlaneGraphModel(space, n_actions, parts=parts)
@@ -116,13 +116,13 @@ _FACTORIES: dict[str, ModelFactory] = {
 
 
 def register_model(name: str, factory: ModelFactory) -> None:
-    """Makes ``model=name`` build a model of your own, so that agents with it can be saved and loaded.
+    """Registers a model of your own as ``model=name``, so that agents with it can be saved and loaded.
 
     Raises:
-        ValueError: the name is taken.
+        ValueError: the name is in use.
     """
     if name in _FACTORIES and _FACTORIES[name] is not factory:
-        raise ValueError(f"A model called {name!r} is registered already; choose another name.")
+        raise ValueError(f"A model called {name!r} is already registered; choose another name.")
     _FACTORIES[name] = factory
 
 
@@ -132,14 +132,14 @@ def build_model(
     """The model registered as ``name``.
 
     Args:
-        name: the model's.
+        name: of the model.
         space: of observations.
         n_actions: number of enumerated actions A.
         learning_rate: of models that have one.
-        parts: number of values of each part of an action, for models that see actions so (decision graphs); None for none.
+        parts: number of values of each action component, for models that use them (decision graphs); None: no components.
 
     Raises:
-        ValueError: there is none.
+        ValueError: no model has this name.
     """
     if name not in _FACTORIES:
         raise ValueError(f"There is no model called {name!r}; choose one of {sorted(_FACTORIES)} or pass a TransitionModel.")

@@ -1,7 +1,7 @@
 """A reward model fitted to observed rewards, for environments whose reward function is not available.
 
-Where no decision graph separates the rewards, a dense network predicts them; compiled code evaluates it, since a search scores
-thousands of transitions for a decision.
+If decision graphs cannot separate the rewards, a network predicts them; dense ones are evaluated by compiled code, since a search
+scores thousands of transitions for a decision.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ class RewardWeights(NamedTuple):
     """The weights of a ``DenseReward`` for compiled code.
 
     Attributes:
-        layout: of the columns.
+        layout: of the input columns.
         first: from columns of state, action and next state, [n, H].
         bias: of the hidden nodes, [H].
         last: to the outputs, padded to a multiple of four rows, [4 * m, H].
-        last_bias: likewise, [4 * m].
-        n_outputs: how many there are.
+        last_bias: of the outputs, likewise padded, [4 * m].
+        n_outputs: number of outputs without padding.
     """
 
     layout: Layout
@@ -69,7 +69,7 @@ class RewardWeights(NamedTuple):
 
 
 def pack_reward(network: DenseReward) -> RewardWeights:
-    """A network's present weights."""
+    """The current weights of a network."""
     with torch.no_grad():
         first, bias = network.first.weight.numpy(), network.first.bias.numpy()
         last, last_bias = network.out.weight.numpy(), network.out.bias.numpy()
@@ -103,7 +103,7 @@ def _outputs(weights: RewardWeights, states: Ints, actions: Ints, next_states: I
 
 
 def reward_outputs(weights: RewardWeights, states: States, actions: Actions, next_states: States) -> Floats:
-    """Outputs of the network, float64 [M, n_outputs]; a row's do not depend on the rows beside it."""
+    """Outputs of the network, float64 [M, n_outputs]; those of a row do not depend on the other rows."""
     out = np.empty((len(states), len(weights.last_bias)), dtype=np.float32)
     rows = [np.ascontiguousarray(part, dtype=np.int64) for part in (states, actions, next_states)]
     _outputs(weights, rows[0], rows[1], rows[2], out)
@@ -111,37 +111,38 @@ def reward_outputs(weights: RewardWeights, states: States, actions: Actions, nex
 
 
 MAX_CLASSES = 64
-"""Up to this many distinct rewards are told apart as classes; more are met by regression."""
+"""Up to this many distinct rewards are predicted by classification, more by regression."""
 
 MAX_GRAPHS = 16
-"""Up to this many distinct rewards are told apart by decision graphs, where these do better than a network."""
+"""Up to this many distinct rewards are predicted by decision graphs, unless a network does better."""
 
 TRAINING_STEPS, BATCH, LEARNING_RATE = 1500, 256, 0.01
 
 FLOOR = 0.01
-"""A network's probabilities of rewards under this count as none, where that does not explain the rewards worse."""
+"""A network's probabilities of rewards below this are set to 0, unless that increases the error on the training data."""
 
 HELD_OUT = 0.15
-"""Share of episodes held out at first."""
+"""Share of episodes held out in the first fit."""
 
 _CHUNK = 256
 
 
 CONTRARY, WRONG = 0.02, 0.1
-"""Shares of transitions with contrary rewards, and of held-out ones with a wrong reward, from which the agent says so."""
+"""Shares of transitions with contradictory rewards, and of held-out ones with wrong predictions, above which advice is given."""
 
 
 @dataclass(frozen=True)
 class RewardReport:
-    """How well rewards can be told.
+    """Quality of the predicted rewards.
 
     Attributes:
-        n_values: how many distinct rewards were met.
-        right: share of transitions whose reward comes out within 0.5% of the range.
-        held_out: the same of episodes that were held out at first, as measured then; NaN where there are none.
-        contrary: share of transitions that had another reward than most with the same (observation, action, next observation).
-        since: after how many transitions rewards changed, for the last time; 0 where they did not. The other figures are then of
-            the transitions whose rewards hold now.
+        n_values: number of distinct observed rewards.
+        right: share of transitions whose predicted reward is right within 0.5% of the range of rewards.
+        held_out: the same for the episodes held out in the first fit, as measured then; NaN if there are none.
+        contrary: share of transitions with another reward than the most frequent one of their (observation, action, next
+            observation).
+        since: number of transitions before the last change of rewards; 0 if there was none. The other figures refer to the
+            transitions whose rewards are still valid.
     """
 
     n_values: int
@@ -152,18 +153,18 @@ class RewardReport:
 
     @property
     def advice(self) -> str | None:
-        """What a user should know, in a sentence; None where all is well."""
+        """Advice for the user, in one sentence; None if there is no problem."""
         if self.since:
             return (
                 f"The environment's rewards changed after about {self.since:,} steps, so the agent plans with those observed "
-                "since then; when you change rewards, give the new goal with set_reward(fn), or call set_env(env), which starts "
-                "the rewards afresh."
+                "since then; when you change rewards, give the new goal with set_reward(fn), or call set_env(env), after which "
+                "earlier rewards are ignored."
             )
         if self.contrary > CONTRARY:
             return (
                 f"{self.contrary:.1%} of rewards differ from what the same observation, action and next observation earned "
-                "before, so the reward is random or hangs on what is not observed (time, history); the agent plans with means. "
-                "mbagent.wrappers.History may show what is missing."
+                "before, so the reward is random or depends on something unobserved (time, history); the agent plans with mean "
+                "rewards. mbagent.wrappers.History may add what is missing."
             )
         if self.held_out < 1.0 - WRONG:
             return (
@@ -174,14 +175,14 @@ class RewardReport:
 
 
 class LearnedReward:
-    """Predicts the reward of (state, action, next state): by decision graphs where these tell rewards apart, else by a network.
+    """Predicts the reward of (state, action, next state), by decision graphs or, if it predicts better, by a network.
 
     Args:
         cardinalities: number of values of each state factor.
         n_actions: number of enumerated actions.
-        planes: layout of the factors, where they form planes.
+        planes: layout of the factors if they form planes, else None.
         seed: of weights and batches.
-        parts: number of values of each part of an action; None: an action is one thing.
+        parts: number of values of each action component; None: actions have no components.
     """
 
     def __init__(
@@ -213,7 +214,7 @@ class LearnedReward:
 
     @one_thread()
     def fit(self, rows: TransitionBatch) -> RewardReport:
-        """Learns from rows, in the order observed; where rewards changed, from those that hold now."""
+        """Fits the model to rows, in the order observed; if rewards changed, to those that are still valid."""
         report = self._learn(rows)
         if report.right < 1.0 or report.held_out < 1.0:  # else no rows contradict each other
             since, hold = self._changed(rows)
@@ -222,7 +223,7 @@ class LearnedReward:
         return report
 
     def _learn(self, rows: TransitionBatch) -> RewardReport:
-        """Learns from most episodes first, to see how it does on the others, and then from all."""
+        """Fits the model to most episodes first, to test it on the held-out ones, and then to all."""
         values = np.unique(rows.rewards)
         self._classes = len(values) <= MAX_CLASSES
         self._values = values if self._classes else np.array([values.mean(), max(values.std(), 1e-6)])
@@ -244,16 +245,16 @@ class LearnedReward:
             if self._graphs is None:
                 self._train(distinct, torch.from_numpy(weights), TRAINING_STEPS // 2 if trained else TRAINING_STEPS)
         right = self._share_right(distinct, weights)
-        return RewardReport(len(values), right, held_out, _contrary(rows))
+        return RewardReport(len(values), right, held_out, _contrary_share(rows))
 
     def _choose(self, train: TransitionBatch, tests: TransitionBatch) -> tuple[float, bool]:
-        """Learns from some rows in the way that does better on others.
+        """Fits graphs and, unless they are perfect, a network; keeps the one that predicts the test rows better.
 
-        Graphs ask for evidence, so that they do not see a reward that was met once or twice; where held-out rows do not tell the
-        ways apart, that decides.
+        Graphs need evidence for a split, so they may miss a reward that was observed once or twice; if the test rows show no
+        difference, the number of such misses decides.
 
         Returns:
-            (share of those that it gets right, whether graphs are clearly better).
+            (share of test rows with the right reward, whether graphs are clearly better).
         """
         graphs = self._graphs = self._as_graphs(train)
         if graphs is None:
@@ -264,11 +265,11 @@ class LearnedReward:
             return right, False
         self._graphs = None
         self._train_on(train)
-        gain, told = self._errors(tests) - errors, missed <= self._missed(train)
+        gain, fewer_misses = self._errors(tests) - errors, missed <= self._missed(train)
         spread = 2.0 * float(gain.std()) / len(gain) ** 0.5
-        # Where rewards are random, held-out rows can hardly tell means apart; graphs have those of the rows.
-        least = -spread if _contrary(train) > 0.0 else 0.0
-        if gain.mean() > spread or (gain.mean() >= least and told):
+        # With random rewards, test rows hardly distinguish means, and those of graphs are the means of the training rows.
+        least = -spread if _contrary_share(train) > 0.0 else 0.0
+        if gain.mean() > spread or (gain.mean() >= least and fewer_misses):
             self._graphs = graphs
             return right, bool(gain.mean() > spread)
         return self._share_right(tests), False
@@ -278,17 +279,18 @@ class LearnedReward:
         self._train(distinct, torch.from_numpy(weights), TRAINING_STEPS)
 
     def _missed(self, rows: TransitionBatch) -> int:
-        """Number of rows that earn something else than most do, and are told as if they did not.
+        """Number of rows with a non-default reward that is predicted as the default.
 
-        What counts is the mean of all rows with the same observation, action and next observation: more cannot be told.
+        Their rewards are averaged over all rows with the same observation, action and next observation, which cannot be
+        distinguished.
         """
-        off, numbers = self._order[0], _numbered(rows)
+        off, numbers = self._order[0], _triple_indices(rows)
         means = (np.bincount(numbers, weights=rows.rewards) / np.bincount(numbers))[numbers]
-        told = np.abs(self(rows.states, rows.actions, rows.next_states) - off)
-        return int((told < 0.5 * np.abs(means - off)).sum())
+        predicted = np.abs(self(rows.states, rows.actions, rows.next_states) - off)
+        return int((predicted < 0.5 * np.abs(means - off)).sum())
 
     def _as_graphs(self, rows: TransitionBatch) -> ClassGraphs | None:
-        """Decision graphs for the rewards of some rows; None where there are too many different ones."""
+        """Decision graphs for the rewards of some rows; None if there are too many distinct ones."""
         if not self._few:
             return None
         graphs, order = self._class_graphs(rows)
@@ -301,14 +303,14 @@ class LearnedReward:
         return self._classes and len(self._values) <= MAX_GRAPHS
 
     def _class_graphs(self, rows: TransitionBatch) -> tuple[ClassGraphs, NDArray[np.int64]]:
-        """Decision graphs for the rewards of some rows, and which reward each class is, the commonest first."""
+        """Decision graphs for the rewards of some rows, and the index of each class's reward, the commonest first."""
         number = np.searchsorted(self._values, rows.rewards)
         common = int(np.bincount(number, minlength=len(self._values)).argmax())
         order = np.concatenate([[common], np.delete(np.arange(len(self._values)), common)])
         return fit_classes(rows, np.argsort(order)[number], self._codec.cardinalities, self._parts, self._planes), order
 
-    def _chances(self, train: TransitionBatch, rows: TransitionBatch) -> Floats:
-        """Probability [N, K] of each reward, as graphs learned from some rows tell them of others."""
+    def _probabilities(self, train: TransitionBatch, rows: TransitionBatch) -> Floats:
+        """Probability [N, K] of each reward of ``rows``, as predicted by graphs fitted to ``train``."""
         graphs, order = self._class_graphs(train)
         parts = (np.ascontiguousarray(part) for part in (rows.states, rows.actions, rows.next_states))
         return class_chances(graphs, len(order), *parts)[:, np.argsort(order)]
@@ -316,42 +318,42 @@ class LearnedReward:
     # ------------------------------------------------------------------ changes
 
     def _changed(self, rows: TransitionBatch) -> tuple[int, NDArray[np.int64]]:
-        """After how many rows rewards changed for the last time, 0 for never, and which rows tell of them as they are now."""
-        order = np.argsort(rows.episodes, kind="stable")  # episode by episode, where several environments take turns
+        """Number of rows before the last change of rewards, 0 if there was none, and indices of the rows that are still valid."""
+        order = np.argsort(rows.episodes, kind="stable")  # episode by episode, since episodes of several environments alternate
         rows = rows.select(order)
         keys, values, since = triples(rows), self._numbers(rows.rewards), 0
-        while found := self._turn(rows.select(slice(since, None)), keys[since:], values[since:]):
+        while found := self._change_point(rows.select(slice(since, None)), keys[since:], values[since:]):
             since += found
         if not since:
             return 0, order
         hold = np.arange(len(rows)) >= since
-        if self._few:  # what was not observed again since holds, unless it is like something whose reward is another now
-            old, new = (self._chances(rows.select(part), rows) for part in (~hold, hold))
+        if self._few:  # older rows not observed again are still valid, unless similar transitions have another reward now
+            old, new = (self._probabilities(rows.select(part), rows) for part in (~hold, hold))
             cells = np.unique(np.concatenate([old, new], axis=1), axis=0, return_inverse=True)[1].ravel()
             hold[:since] = still_hold(cells, values, since) & ~np.isin(keys[:since], keys[since:])
         return since, np.sort(order[hold])
 
     def _numbers(self, rewards: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Numbers of rewards; where there are very many, those of like ones are the same."""
+        """Index of each reward among the distinct ones; if there are very many, of its quantile range."""
         if self._classes:
             return np.searchsorted(self._values, rewards)
         return np.searchsorted(np.quantile(rewards, np.arange(1, MAX_GRAPHS) / MAX_GRAPHS), rewards)
 
-    def _turn(self, rows: TransitionBatch, keys: NDArray[np.int64], values: NDArray[np.int64]) -> int:
-        """The row from which on rewards are others than before, or 0."""
+    def _change_point(self, rows: TransitionBatch, keys: NDArray[np.int64], values: NDArray[np.int64]) -> int:
+        """The row from which rewards differ from those before, or 0."""
         found = turn(keys, values, rows.episodes)
         half = len(rows) // 2
         if found or not self._few or np.isin(keys[half:], keys[:half]).mean() > 0.5:
             return found
-        # Transitions that hardly ever come back are alike where graphs say the same of them; a covariate shift could look like a
-        # change then, so the rows since must predict better, too.
-        chances = self._chances(rows, rows)
-        found = turn(np.unique(chances, axis=0, return_inverse=True)[1].ravel(), values, rows.episodes)
+        # If transitions are hardly ever repeated, those with the same prediction of graphs are grouped. Since a covariate shift
+        # could then look like a change, a fit to the rows after it must also predict better than one to all rows.
+        probabilities = self._probabilities(rows, rows)
+        found = turn(np.unique(probabilities, axis=0, return_inverse=True)[1].ravel(), values, rows.episodes)
         if not found:
             return 0
         tested = (np.arange(len(rows)) >= found) & (np.arange(len(rows)) % 3 == 0)
         tests, known = rows.select(tested), [~tested, ~tested & (np.arange(len(rows)) >= found)]
-        errors = [(self._chances(rows.select(train), tests) @ self._values - tests.rewards) ** 2 for train in known]
+        errors = [(self._probabilities(rows.select(train), tests) @ self._values - tests.rewards) ** 2 for train in known]
         gain = errors[0] - errors[1]
         return found if gain.mean() > 2.0 * gain.std() / len(gain) ** 0.5 else 0
 
@@ -361,8 +363,8 @@ class LearnedReward:
         return errors
 
     def _share_right(self, rows: TransitionBatch, weights: NDArray[np.float32] | None = None) -> float:
-        reach = float(np.ptp(self._values)) if self._classes else 6.0 * float(self._values[1])
-        close = np.abs(self(rows.states, rows.actions, rows.next_states) - rows.rewards) <= 0.005 * max(reach, 1e-12)
+        value_range = float(np.ptp(self._values)) if self._classes else 6.0 * float(self._values[1])
+        close = np.abs(self(rows.states, rows.actions, rows.next_states) - rows.rewards) <= 0.005 * max(value_range, 1e-12)
         return float(np.average(close, weights=weights))
 
     def _train(self, rows: TransitionBatch, weights: Tensor, steps: int) -> None:
@@ -389,30 +391,30 @@ class LearnedReward:
         if self._classes:
             errors = []
             for self._floor in (0.0, FLOOR):
-                told = self(rows.states, rows.actions, rows.next_states)
-                errors.append(float((weights.double().numpy() * (told - rows.rewards) ** 2).sum()))
+                predicted = self(rows.states, rows.actions, rows.next_states)
+                errors.append(float((weights.double().numpy() * (predicted - rows.rewards) ** 2).sum()))
             self._floor = FLOOR if errors[1] <= errors[0] else 0.0
 
     def _compile(self) -> None:
-        """Packs the present weights for compiled code, where there is a kernel for the network."""
+        """Packs the current weights for compiled code, if there is a kernel for the network."""
         self._packed = pack_reward(self._network) if isinstance(self._network, DenseReward) else None
 
     @one_thread()
     @torch.inference_mode()
     def __call__(self, states: States, actions: Actions, next_states: States) -> Floats:
-        """Expected rewards float64 [M]; a row's value does not depend on the rows beside it."""
+        """Expected rewards float64 [M]; those of a row do not depend on the other rows."""
         if len(self._values) == 1:
             return np.full(len(actions), self._values[0])
         if self._graphs is not None:
-            parts_of = (np.ascontiguousarray(part, dtype=np.int64) for part in (states, actions, next_states))
-            return _weighed(class_chances(self._graphs, len(self._order), *parts_of), self._order)
+            arrays = (np.ascontiguousarray(part, dtype=np.int64) for part in (states, actions, next_states))
+            return _expected_values(class_chances(self._graphs, len(self._order), *arrays), self._order)
         if self._packed is not None:
             return self._expected(torch.from_numpy(reward_outputs(self._packed, states, actions, next_states))).numpy()
         parts = [np.zeros(0)]
         for start in range(0, len(actions), _CHUNK):
             rows = [np.ascontiguousarray(part[start : start + _CHUNK]) for part in (states, actions, next_states)]
             n = len(rows[1])
-            # Always the same size: matrix products round differently in other sizes.
+            # Always the same size, since the rounding of matrix products depends on it.
             padded = [np.concatenate([part, np.zeros((_CHUNK - n, *part.shape[1:]), part.dtype)]) for part in rows]
             out = self._network(*(torch.from_numpy(part) for part in padded))[:n]
             parts.append(self._expected(out).numpy())
@@ -421,7 +423,7 @@ class LearnedReward:
     def _expected(self, out: Tensor) -> Tensor:
         if not self._classes:
             return out[:, 0].double() * float(self._values[1]) + float(self._values[0])
-        return torch.from_numpy(_weighed(out.double().softmax(dim=1).numpy(), self._values, self._floor))
+        return torch.from_numpy(_expected_values(out.double().softmax(dim=1).numpy(), self._values, self._floor))
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
         """All weights, as arrays."""
@@ -432,10 +434,10 @@ class LearnedReward:
         return known | {f"network.{name}": value.numpy().copy() for name, value in self._network.state_dict().items()}
 
     def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Takes over what ``state_dict`` returned.
+        """Restores the weights that ``state_dict`` returned.
 
         Raises:
-            ValueError: the arrays are not those of such a reward.
+            ValueError: the arrays do not belong to a reward model of this environment.
         """
         self._values, self._classes = np.array(state["values"]), bool(state["classes"])
         self._floor = float(state.get("floor", FLOOR))  # files of earlier versions have none
@@ -454,7 +456,7 @@ class LearnedReward:
 
 
 class _PlaneReward(nn.Module):
-    """A convolution over the planes of both states; the maxima and sums of its features decide."""
+    """A convolution over the planes of both states, whose features are pooled by maximum and mean."""
 
     def __init__(self, codec: FactorCodec, layout: PlaneLayout, n_out: int, generator: torch.Generator) -> None:
         super().__init__()
@@ -479,7 +481,7 @@ class _PlaneReward(nn.Module):
 def _distinct(rows: TransitionBatch) -> tuple[TransitionBatch, NDArray[np.float32]]:
     """Distinct (s, a, s', r), each weighted by its share among those of the same (s, a, s').
 
-    A rare transition then counts as much as a frequent one, and a random reward keeps its distribution.
+    So rare transitions have the same weight as frequent ones, and random rewards keep their distribution.
     """
     keys, bits = triples(rows), np.ascontiguousarray(rows.rewards).view(np.int64)
     _, first, counts = np.unique(np.stack([keys, bits], axis=1), axis=0, return_index=True, return_counts=True)
@@ -488,22 +490,22 @@ def _distinct(rows: TransitionBatch) -> tuple[TransitionBatch, NDArray[np.float3
     return rows.select(first), shares.astype(np.float32)
 
 
-def _weighed(chances: Floats, values: Floats, floor: float = 0.0) -> Floats:
-    """Expected values [M] by chances [M, K]; of which those below ``floor`` count as none."""
-    p = np.where(chances < floor, 0.0, chances)
-    # Not a matrix product: it would round differently for other numbers of rows.
+def _expected_values(probabilities: Floats, values: Floats, floor: float = 0.0) -> Floats:
+    """Expected values [M] by probabilities [M, K], of which those below ``floor`` are set to 0."""
+    p = np.where(probabilities < floor, 0.0, probabilities)
+    # Not a matrix product, whose rounding would depend on the number of rows.
     expected: Floats = (p / p.sum(axis=1, keepdims=True) * values).sum(axis=1)
     return expected
 
 
-def _numbered(rows: TransitionBatch) -> NDArray[np.int64]:
-    """Numbers 0, 1, ... of the distinct (s, a, s'), int64 [N]."""
+def _triple_indices(rows: TransitionBatch) -> NDArray[np.int64]:
+    """Index 0, 1, ... of each row's (s, a, s') among the distinct ones, int64 [N]."""
     result: NDArray[np.int64] = np.unique(triples(rows), return_inverse=True)[1]
     return result
 
 
-def _contrary(rows: TransitionBatch) -> float:
-    """Share of rows with another reward than the commonest of the same (s, a, s')."""
+def _contrary_share(rows: TransitionBatch) -> float:
+    """Share of rows whose reward is not the commonest one of the same (s, a, s')."""
     bits = np.ascontiguousarray(rows.rewards + 0.0, dtype=np.float64).view(np.int64)  # -0.0 is 0.0
     pairs, counts = np.unique(np.stack([triples(rows), bits], axis=1), axis=0, return_counts=True)
     first = np.flatnonzero(np.r_[True, pairs[1:, 0] != pairs[:-1, 0]])

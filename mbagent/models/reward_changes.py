@@ -1,9 +1,9 @@
-"""Rewards that changed during ``learn``: since when, and which older ones still hold.
+"""Changes of rewards during ``learn``: when they occurred, and which older rewards are still valid.
 
-Random rewards contradict each other all the time; rewards that changed contradict earlier ones from some step on. The evidence
-for such a step is the gain from giving each group of similar transitions one distribution of rewards before it and
-another one after it. It must far exceed the gain in every other order of the same episodes, so that an unobserved property of an
-episode is not mistaken for a change.
+Random rewards contradict each other at all times; changed rewards contradict earlier ones from some step on. The evidence for
+such a step is the gain in log-probability if each group of similar transitions has one distribution of rewards before it and
+another one after it. It must far exceed the gain in permuted orders of the same episodes, so that an unobserved property of
+episodes is not mistaken for a change.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from mbagent.types import Bools, Floats, Ints
 from mbagent_envs.random_keys import hash_rows
 
 ORDERS, TIMES = 20, 1.75
-"""Other orders of the blocks, and how many times their greatest evidence a change needs."""
+"""Number of random permutations of the blocks, and the factor by which a change's evidence must exceed their greatest."""
 
 
 LONG_EPISODE, MOST_EPISODE_BLOCKS = 1000, 50
-"""Blocks are episodes; those that are longer than so many rows, or than this share of all, are cut."""
+"""Blocks are episodes; those longer than LONG_EPISODE rows, or than all rows / MOST_EPISODE_BLOCKS, are divided."""
 
 
 CHANGE_EVIDENCE = 10.0
-"""Nats of evidence that a change needs beyond what other orders have."""
+"""Evidence in nats that a change needs in addition to that of permutations."""
 
 
 COUNT = 0.5
-"""Of a Dirichlet prior over the values of a group."""
+"""Pseudo-count of a Dirichlet prior over the values of a group."""
 
 
 def triples(rows: TransitionBatch) -> Ints:
-    """A number for each (s, a, s'), int64 [N]."""
+    """A hash of each (s, a, s'), int64 [N]."""
     return hash_rows(np.concatenate([rows.states, rows.actions[:, None], rows.next_states], axis=1)).view(np.int64)
 
 
 def wrong_until(rows: TransitionBatch, wrong: Bools) -> int | None:
-    """After how many rows rewards changed to those that a function tells, which is wrong before; None if they did not."""
+    """Number of rows before rewards changed to those of a function, which is ``wrong`` in earlier rows; None without change."""
     order, until = np.argsort(rows.episodes, kind="stable"), 0
     rows, flags = rows.select(order), wrong[order].astype(np.int64)
     keys = triples(rows)
@@ -47,39 +47,39 @@ def wrong_until(rows: TransitionBatch, wrong: Bools) -> int | None:
 
 
 def turn(groups: Ints, values: Ints, episodes: Ints) -> int:
-    """The row from which on rewards are others than before; 0 where nothing says so.
+    """The row from which rewards differ from those before; 0 if there is no evidence of a change.
 
     Args:
-        groups: which transitions are alike, int [N], in order of time, episode by episode.
-        values: numbers of their rewards, int [N].
+        groups: group of similar transitions to which each row belongs, int [N], in order of time, episode by episode.
+        values: indices of the rewards, int [N].
         episodes: int [N].
     """
     groups = np.unique(groups, return_inverse=True)[1].ravel()
     pairs = np.unique(np.stack([groups, values]), axis=1, return_inverse=True)
-    kinds = np.bincount(pairs[0][0])  # different values of each group
-    varied = np.flatnonzero(kinds[groups] > 1)
+    n_distinct = np.bincount(pairs[0][0])  # number of distinct values of each group
+    varied = np.flatnonzero(n_distinct[groups] > 1)
     if not len(varied):
         return 0
     groups, labels, blocks = groups[varied], pairs[1].ravel()[varied], _blocks(episodes)[varied]
-    gains, rng, best = _gains(groups, labels, kinds), np.random.default_rng(0), 0.0
+    gains, rng, best = _gains(groups, labels, n_distinct), np.random.default_rng(0), 0.0
     for _ in range(ORDERS):
         order = np.argsort(rng.permutation(blocks[-1] + 1)[blocks], kind="stable")
-        best = max(best, float(_gains(groups[order], labels[order], kinds).max()))
+        best = max(best, float(_gains(groups[order], labels[order], n_distinct).max()))
     found = int(gains.argmax())
     return int(varied[found + 1]) if gains[found] > CHANGE_EVIDENCE + TIMES * best else 0
 
 
 def still_hold(cells: Ints, values: Ints, since: int) -> Bools:
-    """Which rows before ``since`` lie in cells whose rewards are distributed as before, or were not observed again, [since].
+    """Rows before ``since`` in cells whose rewards have the same distribution after it, or were not observed again, [since].
 
     Args:
-        cells: which transitions are alike, int [N].
-        values: numbers of their rewards, int [N].
-        since: the row from which on rewards are others.
+        cells: cell of similar transitions to which each row belongs, int [N].
+        values: indices of the rewards, int [N].
+        since: the row from which rewards differ.
     """
     cells = np.unique(cells, return_inverse=True)[1].ravel()
-    shape, late = (2, int(cells.max()) + 1, int(values.max()) + 1), (np.arange(len(cells)) >= since).astype(np.int64)
-    counts = np.bincount(np.ravel_multi_index((late, cells, values), shape), minlength=int(np.prod(shape))).reshape(shape)
+    shape, is_later = (2, int(cells.max()) + 1, int(values.max()) + 1), (np.arange(len(cells)) >= since).astype(np.int64)
+    counts = np.bincount(np.ravel_multi_index((is_later, cells, values), shape), minlength=int(np.prod(shape))).reshape(shape)
     n_kinds = (counts.sum(axis=0) > 0).sum(axis=1)
     gain = _evidence(counts[0], n_kinds) + _evidence(counts[1], n_kinds) - _evidence(counts.sum(axis=0), n_kinds)
     same: Bools = (gain <= 0.0)[cells[:since]]
@@ -87,24 +87,24 @@ def still_hold(cells: Ints, values: Ints, since: int) -> Bools:
 
 
 def _evidence(counts: Ints, n_kinds: Ints) -> Floats:
-    """Log-probability [G] of rewards counted [G, K], of which each group has some kinds [G]."""
+    """Log marginal likelihood [G] of rewards with counts [G, K], ``n_kinds`` [G] distinct ones in each group."""
     prior, total = COUNT * n_kinds, counts.sum(axis=1)
     result: Floats = (gammaln(counts + COUNT) - gammaln(COUNT)).sum(axis=1) - gammaln(total + prior) + gammaln(prior)
     return result
 
 
-def _gains(groups: Ints, labels: Ints, kinds: Ints) -> Floats:
-    """Evidence [N] for a change right after each row: predicting forwards to it and backwards from it, not through it."""
-    (rank, behind), (own, own_behind) = _ranks(groups), _ranks(labels)
-    prior = COUNT * kinds[groups]
+def _gains(groups: Ints, labels: Ints, n_distinct: Ints) -> Floats:
+    """Evidence [N] for a change after each row: rows up to it are predicted from earlier ones, the others from later ones."""
+    (rank, remaining), (own, own_remaining) = _ranks(groups), _ranks(labels)
+    prior = COUNT * n_distinct[groups]
     forwards = np.log(own + COUNT) - np.log(rank + prior)
-    backwards = np.log(own_behind + COUNT) - np.log(behind + prior)
+    backwards = np.log(own_remaining + COUNT) - np.log(remaining + prior)
     gains: Floats = np.cumsum(forwards - backwards)
     return gains
 
 
 def _ranks(labels: Ints) -> tuple[Ints, Ints]:
-    """How many rows before, and after, each row have its label, int [N] twice."""
+    """Number of rows before, and after, each row that have its label, int [N] twice."""
     order, counts = np.argsort(labels, kind="stable"), np.bincount(labels)
     rank = np.empty(len(labels), dtype=np.int64)
     rank[order] = np.arange(len(labels)) - (np.cumsum(counts) - counts)[labels[order]]
@@ -112,10 +112,10 @@ def _ranks(labels: Ints) -> tuple[Ints, Ints]:
 
 
 def _blocks(episodes: Ints) -> Ints:
-    """Numbers int [N], ascending, of blocks of rows: whole episodes, or parts of long ones."""
+    """Index of each row's block, int [N], ascending; blocks are whole episodes or parts of long ones."""
     n, rows = len(episodes), np.arange(len(episodes))
     first = np.flatnonzero(np.r_[True, episodes[1:] != episodes[:-1]])
-    begun = first[np.searchsorted(first, rows, side="right") - 1]
+    start = first[np.searchsorted(first, rows, side="right") - 1]
     length = min(max(n // MOST_EPISODE_BLOCKS, 1), LONG_EPISODE)
-    blocks: Ints = np.unique(begun + (rows - begun) // length * length, return_inverse=True)[1].ravel()
+    blocks: Ints = np.unique(start + (rows - start) // length * length, return_inverse=True)[1].ravel()
     return blocks

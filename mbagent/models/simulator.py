@@ -1,4 +1,4 @@
-"""The true model: a game's own rules behind the models' protocol, to compare learned models and planners with."""
+"""The true model: a game's own rules behind the protocol of transition models, for comparisons with learned models."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class SimulatorModel(ExactModel):
     """A game's true dynamics. There is nothing to learn: ``fit`` does nothing and ``state_dict`` is empty.
 
     Args:
-        game: the game; its observation is the whole state.
+        game: the game; its observation must be the whole state.
 
     Attributes:
         lists: whether the game can list its successors with their probabilities.
@@ -32,7 +32,7 @@ class SimulatorModel(ExactModel):
         self.lists = type(game).transition_distributions is not Game.transition_distributions
 
     def start_states(self, n: int, seed: int = 0) -> States:
-        """Start states int64 [n, F] of the game: an agent with this model can plan without having learned."""
+        """Start states int64 [n, F] of the game, with which an agent can plan without learning."""
         return self._factors(self.game.initial(derive(seed, np.arange(n))))
 
     def _observations(self, states: States) -> NDArray[np.int8]:
@@ -48,7 +48,7 @@ class SimulatorModel(ExactModel):
         return self._factors(following), self.game.terminated(observations, actions, following)
 
     def marginals(self, states: States, actions: Actions) -> Floats:
-        """See TransitionModel; exact where the game lists its successors.
+        """See TransitionModel; exact.
 
         Raises:
             NotImplementedError: the game cannot list them.
@@ -66,13 +66,13 @@ class SimulatorModel(ExactModel):
         """
         found = self._listed(states, actions)
         rows = found.rows
-        met = (found.states == next_states[rows]).all(axis=1) & (found.terminated == terminated[rows])
-        mass = np.bincount(rows[met], weights=found.probabilities[met], minlength=len(states))
+        matches = (found.states == next_states[rows]).all(axis=1) & (found.terminated == terminated[rows])
+        mass = np.bincount(rows[matches], weights=found.probabilities[matches], minlength=len(states))
         with np.errstate(divide="ignore"):
             return np.log(mass)
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
-        """See TransitionModel; where the game cannot list successors they are drawn, with numbers shared by all rows."""
+        """See TransitionModel; if the game cannot list successors, they are sampled with random numbers shared by all rows."""
         if not self.lists:
             return super().successors(states, actions, n_samples, seed)
         return thin(self._listed(states, actions), n_samples, seed)

@@ -1,11 +1,11 @@
-"""Systematic and stratified sampling: the outcomes of a (state, action) from few draws, without losing rare ones.
+"""Systematic and stratified sampling: the outcomes of a (state, action) from few samples, including rare outcomes.
 
-Variables are processed one after the other; each particle stands for the values chosen so far. Where all outcomes fit, they are
-listed with their exact probabilities. Elsewhere particles are stratified. The *main* particles are runs of grid points, of which
+Variables are processed one after the other; each particle represents the values chosen so far. If all outcomes fit, they are
+listed with their exact probabilities. Otherwise particles are stratified. The *main* particles are runs of grid points, of which
 each value of a variable gets its share. A value too rare for the grid gets a particle of its own, a *stratum*: all outcomes in
-which this is the first rare value. It carries the stratum's exact probability, and draws the later variables. So every rare value
-of every variable takes part, the weights add up to one, and expected values are unbiased (stratified sampling, Cochran 1977).
-Where there are more strata than slots, two are merged: one of them is kept, with probability proportional to its weight, and gets
+which this is the first rare value. It has the stratum's exact probability, and later variables are sampled. So every rare value
+of every variable is represented, the weights sum to one, and expected values are unbiased (stratified sampling, Cochran 1977).
+If there are more strata than slots, two are merged: one of them is kept, with probability proportional to its weight, and gets
 the weight of both. The stratum in which the episode ends is never merged with another.
 Shapes: n grid points, 2 n slots (main particles first, strata from slot n on), O open variables, K values.
 """
@@ -26,7 +26,7 @@ from mbagent_envs.random_keys import derive, derive_one, uniform_at, uniforms
 
 @inlined
 def largest(probs: Floats, b: int, i: int, n: int) -> int:
-    """The likeliest of the ``n`` values of factor i in row b; the lowest of equals."""
+    """The most probable of the ``n`` values of factor i in row b; the lowest one of equal ones."""
     best = 0
     for k in range(1, n):
         if probs[b, i, k] > probs[b, i, best]:
@@ -36,7 +36,7 @@ def largest(probs: Floats, b: int, i: int, n: int) -> int:
 
 @inlined
 def draw(values: Floats, n: int, u: float) -> int:
-    """Index drawn from the first ``n`` values, which sum to one: the inverse of their running sum at ``u`` in [0, 1)."""
+    """Index sampled from the first ``n`` values, which sum to one: the inverse of their cumulative sum at ``u`` in [0, 1)."""
     chosen = 0
     for k in range(n):
         if values[k] > 0.0:
@@ -48,53 +48,53 @@ def draw(values: Floats, n: int, u: float) -> int:
 
 
 NEGLIGIBLE = 0.01
-"""Probabilities under this share of the variable's largest are taken for noise of the fit, which planners would exploit: they
-count as 0. Decision graphs do so only where no observation stands behind them; networks cannot tell, and do so always."""
+"""Probabilities below this share of the variable's largest are treated as noise of the fit, which planners would exploit, and set
+to 0. Decision graphs do this only for values that were never observed; networks, which cannot distinguish these, always."""
 
 RARE_VALUE, RARE_TOGETHER = 0.05, 0.25
-"""Values of less than the first probability get strata of their own, those that together have less than the second."""
+"""Values below the first probability get strata of their own, if together they are below the second."""
 
 ENOUGH_POINTS = 4.0
-"""Values that so many grid points are expected for are not rare: points tell more of what comes with them than a stratum does."""
+"""Values with this expected number of grid points are not rare: points represent the other variables better than a stratum."""
 
 LARGEST_CHUNK = 2048
-"""Rows worked on at once; bounds the memory."""
+"""Maximum number of rows processed at once; bounds the memory."""
 
 MAIN, STRATA, LISTED, MERGES, PLACE = range(5)
 """Entries of ``Particles.state``: numbers of main particles and of strata, whether all outcomes are listed, merges so far, and a
-number of the state, on which it depends which strata are merged: else the same would be missing everywhere."""
+hash of the state, so that the choice between merged strata differs between states; else all states would miss the same ones."""
 
 _TAG = 1 << 32
-"""Variable number ``i`` with value ``k`` is stratum ``i * _TAG + k``; of whether the episode ends, ``-1 - k``."""
+"""Value ``k`` of variable number ``i`` is stratum ``i * _TAG + k``; for the variable ``terminated`` it is ``-1 - k``."""
 
 _MERGE, _LATER = np.uint64(0x3E46E), np.uint64(0x1A7E5)
-"""Salts of the random numbers that decide between merged strata, and of those that strata draw with."""
+"""Salts of the random numbers that choose between merged strata, and of those that sample the later variables of strata."""
 
 Found: TypeAlias = tuple[Ints, Ints, Bools, Floats, Floats]
-"""Outcomes of some rows: counts [B], states [M, F], terminated [M], probabilities [M]; and what ``Particles.left`` was, [B]."""
+"""Outcomes of rows: counts [B], states [M, F], terminated [M], probabilities [M]; and ``Particles.left`` of each row, [B]."""
 
 Grid: TypeAlias = tuple[int, np.uint64, float]
-"""Number of grid points, the key of their random numbers, and the grid's offset; see ``start``."""
+"""Number of grid points, key of their random numbers, and offset of the grid; see ``start``."""
 
 
 FIRST_POINT, POINTS, TAG = range(3)
-"""Columns of ``Particles.grid``: lowest grid point, number of grid points, which stratum."""
+"""Columns of ``Particles.grid``: lowest grid point, number of grid points, number of the stratum."""
 
 LOW, HIGH, MASS, ORIGINAL_SHARE = range(4)
-"""Columns of ``Particles.chances``: ends of the interval of [0, 1) that the points lie in; exact probability of the outcome so
-far, of a stratum all of its weight; probability that no value so far was rare, of a stratum its own probability."""
+"""Columns of ``Particles.chances``: ends of the particle's interval in [0, 1); exact probability of the values so far, or the
+weight of a stratum including merged ones; probability that no value so far was rare, or the stratum's own probability."""
 
 
 class Particles(NamedTuple):
-    """The particles of one row. Few arrays: handing them from function to function costs time, and to compile that even more.
+    """The particles of one row, in few arrays, since passing arrays between compiled functions costs run and compile time.
 
     Attributes:
         grid: see FIRST_POINT, int64 [2 n, 3].
         chances: see LOW, [2 n, 4].
         factors: values of the row's open variables so far, int64 [2 n, O], in order.
-        rare: probabilities of the values of a variable that are set apart, [K].
+        rare: probabilities of the rare values of the current variable, [K].
         state: see MAIN, int64 [5].
-        left: probability of the strata that found no room, [1].
+        left: probability of the strata that were merged with others and not kept, [1].
     """
 
     grid: Ints
@@ -107,14 +107,14 @@ class Particles(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def start(seed: int) -> tuple[np.uint64, float]:
-    """The key of a seed and the grid's offset in [0, 1)."""
+    """Key and grid offset in [0, 1) of a seed."""
     key = derive(int(seed) % 2**64, 0x5EED)
     return key[0], float(uniforms(key, 1)[0, 0])
 
 
 @compiled
 def new_particles(n_grid: int, n_outputs: int, n_values: int) -> Particles:
-    """Room for a row's particles, over so many variables of so many values at most."""
+    """Arrays for a row's particles, for ``n_outputs`` variables of at most ``n_values`` values."""
     return Particles(
         np.empty((2 * n_grid, 3), dtype=np.int64),
         np.empty((2 * n_grid, 4), dtype=np.float64),
@@ -127,7 +127,7 @@ def new_particles(n_grid: int, n_outputs: int, n_values: int) -> Particles:
 
 @inlined
 def begin(p: Particles, n_grid: int, exact: bool, place: int) -> None:
-    """One particle with all points. ``exact``: there is room to list all outcomes, at most 2 n. ``place``: see PLACE."""
+    """Starts with one particle with all points. ``exact``: all outcomes fit, at most 2 n. ``place``: see PLACE."""
     (
         p.grid[0, FIRST_POINT],
         p.grid[0, POINTS],
@@ -149,7 +149,7 @@ def begin(p: Particles, n_grid: int, exact: bool, place: int) -> None:
 
 @compiled
 def place_of(state: Ints) -> int:
-    """A number of a state [F], see PLACE."""
+    """A hash of a state [F], see PLACE."""
     total = np.uint64(0)
     for f in range(len(state)):
         total = total * np.uint64(31) + np.uint64(state[f] + 1)
@@ -164,13 +164,13 @@ def n_outcomes(p: Particles) -> int:
 
 @inlined
 def slot_of(p: Particles, i: int, n_grid: int) -> int:
-    """Slot of particle number i: main ones first."""
+    """Slot of particle number i, where main particles come first."""
     return int(i if i < p.state[MAIN] else n_grid + i - p.state[MAIN])
 
 
 @compiled
 def prune(values: Floats, n: int) -> None:
-    """Sets negligible probabilities to 0 and scales the rest to sum to one."""
+    """Sets negligible probabilities to 0 and normalises the others."""
     top, total = 0.0, 0.0
     for k in range(n):
         top = max(top, values[k])
@@ -184,9 +184,9 @@ def prune(values: Floats, n: int) -> None:
 
 @compiled
 def settle(probs: Floats, b: int, outputs: Ints, base: Ints) -> None:
-    """Writes to ``base`` [O] the value of each factor of row b that has only one worth drawing, else -1."""
+    """Writes to ``base`` [O] the value of each factor of row b that has only one non-negligible value, else -1."""
     for i in range(len(outputs)):
-        if outputs[i] == 2:  # written out, since most factors of most worlds are settled bits
+        if outputs[i] == 2:  # a case of its own for speed, since most factors are bits with a certain value
             zero, one = probs[b, i, 0], probs[b, i, 1]
             base[i] = 0 if one < NEGLIGIBLE * zero else (1 if zero < NEGLIGIBLE * one else -1)
             continue
@@ -199,13 +199,13 @@ def settle(probs: Floats, b: int, outputs: Ints, base: Ints) -> None:
 
 @inlined
 def bit_chances(one: float, values: Floats) -> None:
-    """Writes the distribution of a bit that is 1 with probability ``one``."""
+    """Writes the distribution of a bit that is 1 with probability ``one`` to ``values``."""
     values[0], values[1] = 1.0 - one, one
 
 
 @inlined
 def n_possible(values: Floats, start: int, n: int) -> int:
-    """How many of ``n`` numbers of ``values`` are above 0."""
+    """Number of positive entries among ``n`` of ``values``, from ``start`` on."""
     count = 0
     for k in range(start, start + n):
         if values[k] > 0.0:
@@ -214,11 +214,11 @@ def n_possible(values: Floats, start: int, n: int) -> int:
 
 
 @compiled
-def _set_apart(values: Floats, rare: Floats, n: int, n_grid: int) -> float:
-    """Moves the rare values [n] to ``rare`` [n], scales the others to sum to one; returns the probability of all rare ones.
+def _separate_rare(values: Floats, rare: Floats, n: int, n_grid: int) -> float:
+    """Moves the probabilities of rare values to ``rare`` [n] and normalises the others; returns the sum of the rare ones.
 
-    Rare values are less probable than some bound, at most RARE_VALUE or ENOUGH_POINTS grid points, and together less probable
-    than RARE_TOGETHER; of equally probable values all are rare or none.
+    Rare values are below a bound of at most RARE_VALUE and ENOUGH_POINTS grid points, chosen such that their sum is below
+    RARE_TOGETHER; of equally probable values all are rare or none.
     """
     bound, total = min(RARE_VALUE, ENOUGH_POINTS / n_grid), RARE_TOGETHER
     while total >= RARE_TOGETHER:
@@ -238,46 +238,45 @@ def _set_apart(values: Floats, rare: Floats, n: int, n_grid: int) -> float:
 
 
 @compiled
-def share_out(p: Particles, only: int, unit: int, w: int, values: Floats, n: int, ends: bool, grid: Grid) -> None:
-    """Shares particles among the values of variable ``unit``, open variable number ``w``.
+def share_out(p: Particles, only: int, variable: int, w: int, values: Floats, n: int, ends: bool, grid: Grid) -> None:
+    """Divides the particles among the values of a variable.
 
     Args:
         p: the particles.
-        only: slot of one particle, where probabilities depend on what it became so far (strata must be done before main ones);
-            -1 for all.
-        unit: number of the variable, which random numbers it draws with.
-        w: where its values are written to.
+        only: slot of one particle, if probabilities depend on its values so far (strata must precede main particles); -1 for all.
+        variable: number of the variable, for its random numbers.
+        w: number of the variable among the open ones: the column of ``Particles.factors`` for its values.
         values: probability of each value, summing to one, overwritten, [n].
         n: number of values.
-        ends: whether the variable tells if the episode ends.
+        ends: whether the variable is ``terminated``.
         grid: see Grid.
     """
-    points, chances, factors, apart, state = p.grid, p.chances, p.factors, p.rare, p.state
-    n_grid, n_main, rare = grid[0], state[MAIN], 0.0
+    points, chances, factors, rare, state = p.grid, p.chances, p.factors, p.rare, p.state
+    n_grid, n_main, rare_mass = grid[0], state[MAIN], 0.0
     if state[LISTED]:
         for q in range(n_main if only < 0 else 1):
             _list_values(p, max(q, only), w, values, n)
         return
     for slot in range(n_grid, n_grid + state[STRATA]):
         if only < 0 or slot == only:
-            factors[slot, w] = draw(values, n, uniform_at(derive_one(grid[1], _LATER + np.uint64(slot)), unit))
+            factors[slot, w] = draw(values, n, uniform_at(derive_one(grid[1], _LATER + np.uint64(slot)), variable))
     if only >= n_grid:
         return
-    rare = _set_apart(values, apart, n, n_grid)
+    rare_mass = _separate_rare(values, rare, n, n_grid)
     for i in range(n_main if only < 0 else 1):
         q = max(i, only)
         here = points[q, POINTS] / n_grid * chances[q, ORIGINAL_SHARE]
-        for k in range(n if rare > 0.0 else 0):
-            if apart[k] > 0.0:
-                _add_stratum(p, q, unit, k, w, here * apart[k], ends, grid)
-        chances[q, MASS] *= 1.0 - rare
-        chances[q, ORIGINAL_SHARE] *= 1.0 - rare
-        state[MAIN] = _split(p, q, state[MAIN], unit, w, values, n, grid)
+        for k in range(n if rare_mass > 0.0 else 0):
+            if rare[k] > 0.0:
+                _add_stratum(p, q, variable, k, w, here * rare[k], ends, grid)
+        chances[q, MASS] *= 1.0 - rare_mass
+        chances[q, ORIGINAL_SHARE] *= 1.0 - rare_mass
+        state[MAIN] = _split(p, q, state[MAIN], variable, w, values, n, grid)
 
 
 @compiled
 def _list_values(p: Particles, q: int, w: int, values: Floats, n: int) -> None:
-    """One particle for each possible value; the first keeps the slot."""
+    """Replaces particle ``q`` by one particle for each possible value; the first one keeps the slot."""
     chances, factors, state = p.chances, p.factors, p.state
     slot, mass, last = q, chances[q, MASS], state[MAIN]
     for k in range(n):
@@ -294,9 +293,9 @@ def _list_values(p: Particles, q: int, w: int, values: Floats, n: int) -> None:
 
 @compiled
 def _split(p: Particles, q: int, n_live: int, i: int, w: int, values: Floats, n: int, grid: Grid) -> int:
-    """Shares the points of main particle ``q`` among the values of variable i; returns how many main ones there are.
+    """Divides the points of main particle ``q`` among the values of variable i; returns the number of main particles.
 
-    The first value with a point keeps the slot; particles for further ones are appended.
+    The first value with a point keeps the slot; particles for further values are appended.
     """
     points, chances, factors = p.grid, p.chances, p.factors
     n_grid, key, offset = grid
@@ -337,9 +336,9 @@ def _split(p: Particles, q: int, n_live: int, i: int, w: int, values: Floats, n:
 
 @compiled
 def _slot_for(p: Particles, tag: int, ends: bool, n_grid: int) -> int:
-    """Slot of a stratum: its own, a new one of mass 0, or that of another which it is to be merged with."""
+    """Slot of a stratum: its own, a new one of mass 0, or that of another one with which it has to be merged."""
     points, chances, state = p.grid, p.chances, p.state
-    last, room = n_grid + int(state[STRATA]), n_grid if ends else max(1, n_grid - 1)  # one is kept for the end
+    last, room = n_grid + int(state[STRATA]), n_grid if ends else max(1, n_grid - 1)  # one is reserved for termination
     for slot in range(n_grid, last):
         if points[slot, TAG] == tag:
             return slot
@@ -357,11 +356,11 @@ def _slot_for(p: Particles, tag: int, ends: bool, n_grid: int) -> int:
 
 
 @compiled
-def _add_stratum(p: Particles, q: int, unit: int, k: int, w: int, weight: float, ends: bool, grid: Grid) -> None:
-    """Adds main particle q with value k of a variable to the strata, with some weight."""
+def _add_stratum(p: Particles, q: int, variable: int, k: int, w: int, weight: float, ends: bool, grid: Grid) -> None:
+    """Adds main particle q with value k of a variable to the strata, with the given weight."""
     points, chances, factors, state = p.grid, p.chances, p.factors, p.state
     n_grid, key, _ = grid
-    tag = -1 - k if ends else unit * _TAG + k
+    tag = -1 - k if ends else variable * _TAG + k
     slot = _slot_for(p, tag, ends, n_grid)
     before, total = chances[slot, MASS], chances[slot, MASS] + weight
     if before > 0.0:
@@ -384,10 +383,11 @@ def _add_stratum(p: Particles, q: int, unit: int, k: int, w: int, weight: float,
 
 @compiled
 def weigh(p: Particles, n_grid: int) -> None:
-    """Turns the particles' masses into their probabilities, summing to one.
+    """Turns the particles' masses into probabilities that sum to one.
 
-    Where all outcomes are listed they are exact. Else a main particle that was sure to be found keeps its own, and a less
-    probable one has that of a grid point: what it was found with (Hájek 1971: mass by the chance of being found, scaled).
+    If all outcomes are listed, these are exact. Otherwise a main particle with at least the probability of a grid point, whose
+    inclusion is certain, keeps its own; a less probable one gets that of a grid point (Hájek 1971: mass divided by the
+    probability of inclusion, normalised).
     """
     points, chances, n_main, total = p.grid, p.chances, p.state[MAIN], 0.0
     if not p.state[LISTED]:
@@ -405,15 +405,15 @@ def weigh(p: Particles, n_grid: int) -> None:
 
 
 @compiled
-def write(p: Particles, base: Ints, still_open: Ints, n_open: int, n_grid: int, total: int, found: Found) -> int:
-    """Writes a row's outcomes from number ``total`` on, the open factors' values filled in to ``base`` [O]; returns how many."""
+def write(p: Particles, base: Ints, open_factors: Ints, n_open: int, n_grid: int, total: int, found: Found) -> int:
+    """Writes a row's outcomes from index ``total`` on, ``base`` [O] with the open factors' values; returns their number."""
     _, states, terminated, probabilities, _ = found
     n_factors = states.shape[1]
     weigh(p, n_grid)
     for i in range(n_outcomes(p)):
         slot = slot_of(p, i, n_grid)
         for w in range(n_open):
-            base[still_open[w]] = p.factors[slot, w]
+            base[open_factors[w]] = p.factors[slot, w]
         for f in range(n_factors):
             states[total + i, f] = base[f]
         terminated[total + i] = base[n_factors] == 1
@@ -423,7 +423,7 @@ def write(p: Particles, base: Ints, still_open: Ints, n_open: int, n_grid: int, 
 
 @compiled
 def room(n_rows: int, n_grid: int, n_outputs: int) -> Found:
-    """Room for as many outcomes as there can be."""
+    """Arrays for the maximum number of outcomes."""
     most = 2 * n_rows * n_grid
     return (
         np.empty(n_rows, dtype=np.int64),
@@ -436,13 +436,13 @@ def room(n_rows: int, n_grid: int, n_outputs: int) -> Found:
 
 @compiled
 def used(found: Found, total: int) -> Found:
-    """The part of the room that was used."""
+    """The part of the arrays that is in use."""
     counts, states, terminated, probabilities, left = found
     return counts, states[:total], terminated[:total], probabilities[:total], left
 
 
 def assemble(parts: list[Found], n_outputs: int) -> Successors:
-    """Successors from the outcomes found in consecutive runs of rows."""
+    """Successors from the outcomes of consecutive runs of rows."""
     if not parts:
         none = np.zeros((0, n_outputs - 1), dtype=np.int64)
         return Successors(np.zeros(1, dtype=np.int64), none, np.zeros(0, dtype=np.bool_), np.zeros(0))
@@ -455,19 +455,19 @@ def assemble(parts: list[Found], n_outputs: int) -> Successors:
 
 
 def rows_at_once(n_samples: int, n_outputs: int) -> int:
-    """How many rows to work on at once."""
+    """Number of rows to process at once."""
     return max(1, min(LARGEST_CHUNK, (1 << 24) // (2 * n_samples * n_outputs)))
 
 
 def thin(full: Successors, n_samples: int, seed: int) -> Successors:
-    """Cuts rows with more than ``n_samples`` successors down to at most twice as many.
+    """Reduces rows with more than ``n_samples`` successors to at most ``2 * n_samples``.
 
-    What is rare stays as long as there is room, and that the episode ends always does; see ``particles.py``.
+    Rare successors are kept as far as there is room, and termination always; see the module's docstring.
 
     Args:
         full: all successors, with exact probabilities.
-        n_samples: grid points a row.
-        seed: which random numbers; the same for all rows.
+        n_samples: number of grid points for each row.
+        seed: of the random numbers, which are the same for all rows.
     """
     counts = np.diff(full.offsets)
     if counts.max(initial=0) <= n_samples:
@@ -480,7 +480,7 @@ def thin(full: Successors, n_samples: int, seed: int) -> Successors:
 
 @compiled
 def _thinned(offsets: Ints, terminated: Bools, probabilities: Floats, grid: Grid) -> tuple[Ints, Ints, Floats]:
-    """Of each row, how many successors stay; of all of these, their numbers and probabilities."""
+    """Number of successors kept in each row, and the indices and probabilities of all that are kept."""
     n_rows, n_grid, total, most = len(offsets) - 1, grid[0], 0, 0
     for b in range(n_rows):
         most = max(most, offsets[b + 1] - offsets[b])

@@ -1,6 +1,6 @@
-"""Tabular models: a known table of outcomes, as Gymnasium's toy_text environments have, and counts of observed transitions.
+"""Tabular models: a known table of outcomes, as in Gymnasium's toy_text environments, and counts of observed transitions.
 
-Counts are exact where every (state, action) was observed often, and know nothing of others (paper section 2.1).
+Counts are accurate for (state, action) pairs that were observed often, but do not generalise to others (paper section 2.1).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mbagent_envs.random_keys import derive, hash_rows, uniforms
 
 
 class TabularMDP(ExactModel):
-    """A world of one factor whose rules are known. There is nothing to learn: ``fit`` does nothing, ``state_dict`` is empty.
+    """An MDP with one factor and known outcomes. There is nothing to learn: ``fit`` does nothing, ``state_dict`` is empty.
 
     Args:
         offsets: where the outcomes of (state, action) begin, int64 [S * A + 1], pair number ``state * A + action``.
@@ -55,15 +55,15 @@ class TabularMDP(ExactModel):
         lengths = {len(next_states), len(terminated), len(probabilities), int(offsets[-1])}
         if rest or len(lengths) > 1 or (np.diff(offsets) < 1).any() or not np.allclose(totals, 1.0):
             raise ValueError(
-                "A table needs outcomes for every (state, action), with one next state, end and probability each, summing to one."
+                "A table needs outcomes for every (state, action), arrays of equal length, and probabilities summing to one."
             )
 
     def start_states(self, n: int, seed: int = 0) -> States:
-        """All start states, int64 [n or fewer, 1]."""
+        """The first n start states, or all if there are fewer, int64 [n or fewer, 1]."""
         return self._start[:n, None]
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
-        """See TransitionModel; all of them, where they are few."""
+        """See TransitionModel; all successors if they are few."""
         pairs = states[:, 0] * self.n_actions + actions
         counts = np.diff(self.offsets)[pairs]
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
@@ -89,27 +89,27 @@ class TabularMDP(ExactModel):
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
         """See TransitionModel."""
         found = self.successors(states, actions, len(self.probabilities), 0)
-        met = (found.states[:, 0] == next_states[found.rows, 0]) & (found.terminated == terminated[found.rows])
+        matches = (found.states[:, 0] == next_states[found.rows, 0]) & (found.terminated == terminated[found.rows])
         with np.errstate(divide="ignore"):
-            result: Floats = np.log(np.bincount(found.rows[met], weights=found.probabilities[met], minlength=len(states)))
+            result: Floats = np.log(np.bincount(found.rows[matches], weights=found.probabilities[matches], minlength=len(states)))
         return result
 
 
 def toy_text_model(env: gym.Env[Any, Any]) -> tuple[TabularMDP, Callable[[Any, Any, Any], Floats]]:
     """The true model of a Gymnasium toy_text environment, and its reward as a function of (obs, action, next_obs).
 
-    Rewards of outcomes that share (obs, action, next_obs) are averaged by their probabilities.
+    Rewards of outcomes with the same (obs, action, next_obs) are averaged, weighted by their probabilities.
 
     Args:
-        env: with ``unwrapped.P[state][action] -> [(probability, next state, reward, terminated)]``.
+        env: environment with ``unwrapped.P[state][action] -> [(probability, next state, reward, terminated)]``.
 
     Raises:
-        TypeError: it has no such table.
+        TypeError: the environment has no such table.
     """
     unwrapped: Any = env.unwrapped
     if not hasattr(unwrapped, "P") or not hasattr(unwrapped, "initial_state_distrib"):
         raise TypeError(
-            f"{unwrapped} has no table of its rules: it lacks P or initial_state_distrib, as toy_text's tables have them."
+            f"{unwrapped} has no table of its rules: it lacks the attributes P or initial_state_distrib of toy_text environments."
         )
     table, n_actions = unwrapped.P, int(unwrapped.action_space.n)
     n_states = len(table)
@@ -147,16 +147,16 @@ _ARRAYS = ("states", "actions", "next_states", "terminated", "counts")
 
 
 class TabularModel(BaseTransitionModel):
-    """Frequencies of the outcomes met after each (state, action), with a prior that nothing changes.
+    """Frequencies of the outcomes observed after each (state, action), with a prior for an unchanged state.
 
-    The probability of an outcome met c times in n is (c + prior if it is "the same state, not terminated") / (n + prior).
-    After a pair never met, nothing changes.
+    An outcome observed c times in n transitions has probability c / (n + prior); the outcome "same state, not terminated" has
+    (c + prior) / (n + prior). After an unobserved pair, the state is predicted to stay unchanged.
 
     Args:
         cardinalities: number of values of each state factor, length F.
         n_actions: number of enumerated actions A.
-        prior: weight of "nothing changes", in transitions.
-        validation: share of episodes held out to measure the fit; the final table is made of all.
+        prior: weight of the outcome "same state, not terminated", in transitions.
+        validation: share of episodes held out to measure the fit; the final table uses all episodes.
     """
 
     def __init__(self, cardinalities: tuple[int, ...], n_actions: int, *, prior: float = 0.0, validation: float = 0.1) -> None:
@@ -169,7 +169,7 @@ class TabularModel(BaseTransitionModel):
         self._store(ints, none, ints, none.astype(np.bool_), none)
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
-        """See TransitionModel. Counts all of ``data`` anew; ``seed`` says which episodes the report's figures hold out."""
+        """See TransitionModel. Replaces earlier counts; ``seed`` selects the held-out episodes of the report."""
         began = time.perf_counter()
         train, held_out = data.split(self.validation, seed)
         self._count(train)
@@ -189,7 +189,7 @@ class TabularModel(BaseTransitionModel):
         )
 
     def visits(self, states: States, actions: Actions) -> NDArray[np.int64]:
-        """How often each (state, action) was met, int64 [B]."""
+        """Number of times that each (state, action) was observed, int64 [B]."""
         pair = self._find(states, actions)
         totals = np.append(self._totals, 0)
         result: NDArray[np.int64] = totals[pair]
@@ -214,21 +214,21 @@ class TabularModel(BaseTransitionModel):
         return result
 
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
-        """See TransitionModel; minus infinity for outcomes never met."""
+        """See TransitionModel; minus infinity for outcomes of probability 0."""
         found = self._full(states, actions)
         rows = found.rows
-        met = (found.states == next_states[rows]).all(axis=1) & (found.terminated == terminated[rows])
-        mass = np.bincount(rows[met], weights=found.probabilities[met], minlength=len(states))
+        matches = (found.states == next_states[rows]).all(axis=1) & (found.terminated == terminated[rows])
+        mass = np.bincount(rows[matches], weights=found.probabilities[matches], minlength=len(states))
         with np.errstate(divide="ignore"):
             result: Floats = np.log(mass)
         return result
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
-        """See TransitionModel; all outcomes met, with their probabilities, where they are few."""
+        """See TransitionModel; all observed outcomes with their probabilities, if they are few."""
         return thin(self._full(states, actions), n_samples, seed)
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
-        """See TransitionModel: distinct transitions and how often each was met."""
+        """See TransitionModel: distinct transitions and their counts."""
         sources = np.repeat(np.arange(len(self._pairs)), np.diff(self._offsets))
         arrays = (
             self._pair_states[sources],
@@ -244,14 +244,14 @@ class TabularModel(BaseTransitionModel):
         """See TransitionModel.
 
         Raises:
-            ValueError: these are not the arrays of a table over states of this width; nothing is changed then.
+            ValueError: the arrays are not those of a table for states with this number of factors; nothing is changed then.
         """
         if sorted(state) != sorted(_ARRAYS):
             raise ValueError(f"A table has the arrays {', '.join(_ARRAYS)}, but was given {', '.join(sorted(state))}.")
         wide = (len(state["counts"]), len(self.cardinalities))
         if np.shape(state["states"]) != wide or np.shape(state["next_states"]) != wide:
             raise ValueError(
-                f"This table is over states of {wide[1]} factors, but was given arrays of shape "
+                f"This table is for states of {wide[1]} factors, but was given arrays of shape "
                 f"{np.shape(state['states'])}; build the model for the space that the table was saved from."
             )
         states, actions, next_states, terminated, counts = (np.asarray(state[name]).astype(np.int64) for name in _ARRAYS)
@@ -265,7 +265,7 @@ class TabularModel(BaseTransitionModel):
         self._store(distinct.states, distinct.actions, distinct.next_states, distinct.terminated, counts)
 
     def _store(self, states: States, actions: Actions, next_states: States, terminated: Bools, counts: NDArray[np.int64]) -> None:
-        """Builds the table from distinct transitions, adding "nothing changes" to each pair if the prior asks for it."""
+        """Builds the table from distinct transitions; with a prior, adds the outcome "same state" to each pair."""
         if self.prior > 0.0 and len(counts):
             _, first = np.unique(_pair_tags(states, actions), return_index=True)
             same = (next_states == states).all(axis=1) & ~terminated
@@ -276,7 +276,7 @@ class TabularModel(BaseTransitionModel):
             terminated = np.concatenate([terminated, np.zeros(len(missing), dtype=np.bool_)])
             counts = np.concatenate([counts, np.zeros(len(missing), dtype=np.int64)])
         tags = _pair_tags(states, actions)
-        order = np.lexsort((terminated, *next_states.T[::-1], tags))  # one order, whatever the order of experience
+        order = np.lexsort((terminated, *next_states.T[::-1], tags))  # independent of the order of the data
         self._pairs, first, sizes = np.unique(tags[order], return_index=True, return_counts=True)
         self._pair_states, self._pair_actions = states[order][first], actions[order][first]
         self._next_states, self._terminated = next_states[order], terminated[order]
@@ -288,7 +288,7 @@ class TabularModel(BaseTransitionModel):
         self._weights = (self._counts + self.prior * same) / (self._totals + self.prior)[source]
 
     def _find(self, states: States, actions: Actions) -> NDArray[np.int64]:
-        """Number of each (state, action) in the table, int64 [B]; -1 if it was never met."""
+        """Index of each (state, action) in the table, int64 [B]; -1 if it was never observed."""
         tags = _pair_tags(states, actions)
         if len(self._pairs) == 0:
             return np.full(len(tags), -1, dtype=np.int64)
@@ -296,7 +296,7 @@ class TabularModel(BaseTransitionModel):
         return np.where(self._pairs[place] == tags, place, -1).astype(np.int64)
 
     def _full(self, states: States, actions: Actions) -> Successors:
-        """All outcomes of each row; of a pair never met, that nothing changes."""
+        """All outcomes of each row; for unobserved pairs the unchanged state."""
         pair = self._find(states, actions)
         starts = np.append(self._offsets, self._offsets[-1])
         counts = np.where(pair >= 0, np.diff(starts)[pair], 1)
@@ -311,7 +311,7 @@ class TabularModel(BaseTransitionModel):
         return Successors(offsets, next_states, terminated, weights)
 
     def _measure(self, rows: TransitionBatch) -> tuple[float, float]:
-        """Held-out nats a transition, over those whose outcome was met before, and share of likeliest outcomes met."""
+        """Nats per held-out transition, over those with positive probability, and share whose likeliest outcome is right."""
         if len(rows) == 0:
             return 0.0, 1.0
         logs = self.log_prob(rows.states, rows.actions, rows.next_states, rows.terminated)
@@ -324,7 +324,7 @@ class TabularModel(BaseTransitionModel):
 
 @compiled
 def _choose(pair: NDArray[np.int64], offsets: NDArray[np.int64], weights: Floats, u: Floats) -> NDArray[np.int64]:
-    """The entry of the table drawn for each row, by the inverse of its pair's running sum at ``u``; -1 for unknown pairs."""
+    """Sampled table entry of each row, by the inverse of its pair's cumulative sum at ``u``; -1 for unknown pairs."""
     chosen = np.full(len(pair), -1, dtype=np.int64)
     for b in range(len(pair)):
         if pair[b] < 0:

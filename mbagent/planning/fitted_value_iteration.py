@@ -1,8 +1,8 @@
 """Fitted value iteration for MDPs too large to solve: values linear in active features and in pairs of them.
 
-States are sampled from simulated play, at first at random and then greedily by the values fitted so far; values are backed up
-through the model's successors and fitted by kernel ridge regression, over and over (Gordon 1995; Guestrin, Koller, Parr and
-Venkataraman 2003 for sums over few factors each). They hold for one reward function and are dropped with it.
+States are sampled from simulated play, which is random at first and then greedy on the values fitted so far. Backups through the
+model's successors alternate with kernel ridge regression (Gordon 1995; Guestrin, Koller, Parr and Venkataraman 2003 for sums of
+functions of few factors). The values apply to one reward function and are dropped with it.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from mbagent_envs.jit import compiled
 from mbagent_envs.random_keys import derive
 
 RIDGE = 0.1
-"""Strength of the pull towards equal values, in states."""
+"""Ridge penalty, which shrinks values towards their mean; in units of one state's weight."""
 
 PAIRED = 0.3
-"""Weight of pairs beside single columns: how large their part is expected to be."""
+"""Weight of pairs of features relative to single features: the expected size of their contribution."""
 
 MOST_PAIRS = 10_000_000
-"""Pairs in all states that are to be valued, at most; where there are more, there are no pairs."""
+"""Maximum number of pairs, summed over the states to evaluate; if there are more, pairs are not used."""
 
 MOST_PAIR_FEATURES = 2000
-"""Columns between which there can be pairs."""
+"""Maximum number of features for which pairs are used."""
 
 
 class PairRegression:
-    """Regression for many targets on the same states; columns are as in LeafValues, each factor's commonest value is none.
+    """Regression of many targets on the same states; features as in LeafValues, none for the commonest value of each factor.
 
-    The kernel of two states that share d columns is d + PAIRED d (d - 1) / 2, which counts every pair of columns as one more.
+    The kernel of two states that share d features is d + PAIRED d (d - 1) / 2, so each shared pair counts as a further feature.
 
     Args:
-        states: int64 [N, F], whose values are given, one at least.
-        cardinalities: of the factors.
-        valued: int64 [M, F], whose values are asked for.
+        states: int64 [N, F], states whose values are given, at least one.
+        cardinalities: number of values of each factor, length F.
+        valued: int64 [M, F], states whose values are predicted.
         low, high: bounds of values.
     """
 
@@ -56,32 +56,32 @@ class PairRegression:
         self._column = np.full(int(counts.sum()), -1)
         self._column[used] = np.arange(len(used))
         self._x = csr_array((np.ones(len(rows)), (rows, column)), shape=(len(states), len(used)))
-        self._on, self._begin = self._shown(valued)
+        self._on, self._begin = self._active_features(valued)
         n_on = np.diff(self._begin)
         self._paired = len(used) <= MOST_PAIR_FEATURES and int((n_on * (n_on - 1) // 2).sum()) <= MOST_PAIRS
         shared = (self._x @ self._x.T).toarray()
         kernel = shared + (PAIRED / 2.0) * shared * (shared - 1.0) if self._paired else shared
-        self._typical = kernel.mean(axis=0)
-        centred = kernel - self._typical - self._typical[:, None] + self._typical.mean()
+        self._kernel_mean = kernel.mean(axis=0)
+        centred = kernel - self._kernel_mean - self._kernel_mean[:, None] + self._kernel_mean.mean()
         self._factor, self._bounds = cho_factor(centred + RIDGE * np.eye(len(states))), (low, high)
 
-    def _shown(self, states: States) -> tuple[Ints, Ints]:
-        """Columns that are on in states [M, F], those of one after another, and where each one's begin, int64 [M + 1]."""
+    def _active_features(self, states: States) -> tuple[Ints, Ints]:
+        """Active features of states [M, F], concatenated, and the offset of each state's first one, int64 [M + 1]."""
         rows, factors = np.nonzero(states != self._common)
         column = self._column[self._first[factors] + states[rows, factors]]
         known = column >= 0
         return column[known], np.searchsorted(rows[known], np.arange(len(states) + 1)).astype(np.int64)
 
     def fit(self, values: Floats) -> LeafValues:
-        """What fits values [N] of the states best."""
+        """Value function fitted to values [N] of the states."""
         mean, x = float(values.mean()), self._x
-        share = cho_solve(self._factor, values - mean)
-        pairs = PAIRED * (x.T @ x.multiply(share[:, None])).toarray() if self._paired else np.zeros((0, 0))
-        level = mean - float(share @ self._typical)
-        return LeafValues(self._common, self._first, self._column, level, x.T @ share, pairs, *self._bounds)
+        dual = cho_solve(self._factor, values - mean)
+        pairs = PAIRED * (x.T @ x.multiply(dual[:, None])).toarray() if self._paired else np.zeros((0, 0))
+        level = mean - float(dual @ self._kernel_mean)
+        return LeafValues(self._common, self._first, self._column, level, x.T @ dual, pairs, *self._bounds)
 
     def values(self, leaf: LeafValues) -> Floats:
-        """Values [M] of the states that they are asked for."""
+        """Predicted values [M] of the states ``valued``."""
         out = np.empty(len(self._begin) - 1)
         _sums(leaf, self._on, self._begin, out)
         return out
@@ -94,48 +94,48 @@ def _sums(leaf: LeafValues, on: Ints, begin: Ints, out: Floats) -> None:
 
 
 ITERATIONS = 3
-"""Times that play, and the fit after it, are repeated."""
+"""Number of rounds, each of simulated play and a fit."""
 
 STATES_A_ROUND = 600
-"""States taken from each round of play."""
+"""Maximum number of states that are taken from each round of play."""
 
 EPISODES = 64
-"""Episodes imagined side by side."""
+"""Number of episodes simulated in parallel."""
 
 EPISODE_STEPS = 40
-"""Steps of each of them."""
+"""Number of steps of each simulated episode."""
 
 RANDOM_ACTION = 0.2
-"""Share of random actions once there are values to play by."""
+"""Share of random actions in play that is greedy on fitted values."""
 
 FEWEST_SAMPLES, MOST_ROW_SAMPLES = 4, 32
-"""Draws for each (state, action), at least and at most."""
+"""Minimum and maximum number of samples for each (state, action)."""
 
 SAMPLES_IN_ALL = 8000
-"""Draws for each action, about: the fewer states were met, the more for each."""
+"""Approximate number of samples for each action over all states: fewer states get more samples each."""
 
 SAMPLED_TOGETHER = 4
-"""States that share their luck; values are to be means over many lucks."""
+"""Number of states that share random numbers. Small, so that values are averaged over many different random numbers."""
 
 SWEEPS = 150
-"""Backups and fits in a round, at most."""
+"""Maximum number of backups and fits in a round."""
 
 CONVERGED = 1e-4
-"""They end when no value moves by more than this share of the largest reward."""
+"""They end when no value changes by more than this share of the largest absolute reward."""
 
 _PLAY_SALT, _EXPAND_SALT, _SAMPLE_SALT = 0xF1A1, 0xF1A2, 0xF1A3
 
 
 @dataclass(frozen=True)
 class Task:
-    """What values are learned for.
+    """The problem for which values are learned.
 
     Attributes:
-        model: what to imagine with.
-        goal: what is wanted.
+        model: transition model for simulations.
+        goal: reward function.
         start: int64 [S, F], start states.
         gamma: discount.
-        seed: which random numbers.
+        seed: of the random numbers.
     """
 
     model: TransitionModel
@@ -152,40 +152,40 @@ def _back_up(graph: GraphArrays, rewards: Floats, gamma: float, nodes: Ints, v: 
 
 
 def learn_values(task: Task) -> tuple[LeafValues, States]:
-    """What states are worth under the best behaviour found in imagined play.
+    """Values of states under the best policy found in simulated play.
 
     Returns:
-        (values, ``LOWEST_KNOWN`` where all steps earn the same; states int64 [N, F] that were met, distinct).
+        (values, or ``LOWEST_KNOWN`` if all rewards are equal; distinct states int64 [N, F] that were visited).
     """
-    leaf, met = LOWEST_KNOWN, np.zeros((0, len(task.model.cardinalities)), dtype=np.int64)
+    leaf, visited = LOWEST_KNOWN, np.zeros((0, len(task.model.cardinalities)), dtype=np.int64)
     for number in range(ITERATIONS):
         played = _play(task, leaf, number)
         rng = np.random.default_rng([task.seed, number])
-        some = rng.choice(len(played), size=min(len(played), STATES_A_ROUND), replace=False)
-        met = np.unique(np.concatenate([met, played[np.sort(some)]]), axis=0)
-        leaf = _fit(task, met, leaf, number)
-    return leaf, met
+        chosen = rng.choice(len(played), size=min(len(played), STATES_A_ROUND), replace=False)
+        visited = np.unique(np.concatenate([visited, played[np.sort(chosen)]]), axis=0)
+        leaf = _fit(task, visited, leaf, number)
+    return leaf, visited
 
 
 def _play(task: Task, leaf: LeafValues, number: int) -> States:
-    """States int64 [N, F] met by playing greedily on the values; by chance at first."""
+    """States int64 [N, F] visited by play that is greedy on the values, or random if there are none yet."""
     rng = np.random.default_rng([task.seed, number, _PLAY_SALT])
-    states, met = task.start[rng.integers(len(task.start), size=EPISODES)], []
+    states, visited = task.start[rng.integers(len(task.start), size=EPISODES)], []
     for step in range(EPISODE_STEPS):
-        met.append(states)
+        visited.append(states)
         actions = rng.integers(task.model.n_actions, size=EPISODES)
         if len(leaf.common):
-            by_chance = rng.random(EPISODES) < RANDOM_ACTION
-            actions = np.where(by_chance, actions, greedy_actions(task, leaf, states, number * EPISODE_STEPS + step))
+            is_random = rng.random(EPISODES) < RANDOM_ACTION
+            actions = np.where(is_random, actions, greedy_actions(task, leaf, states, number * EPISODE_STEPS + step))
         keys = derive(task.seed, _SAMPLE_SALT, number * EPISODE_STEPS + step, np.arange(EPISODES))
-        after, over = task.model.sample(states, actions, keys)
-        again = task.start[rng.integers(len(task.start), size=EPISODES)]
-        states = np.where(over[:, None], again, after)
-    return np.concatenate(met)
+        after, terminated = task.model.sample(states, actions, keys)
+        restarts = task.start[rng.integers(len(task.start), size=EPISODES)]
+        states = np.where(terminated[:, None], restarts, after)
+    return np.concatenate(visited)
 
 
 def greedy_actions(task: Task, leaf: LeafValues, states: States, step: int) -> Actions:
-    """The actions [B] that are best one step ahead of states int64 [B, F]."""
+    """Greedy actions [B] in states int64 [B, F], by one-step lookahead."""
     graph = StateGraph(task.model)
     nodes = graph.add(states, np.zeros(len(states), dtype=np.int64))
     distinct, v, _, q, rewards = _expanded(task, graph, leaf, step)
@@ -195,7 +195,11 @@ def greedy_actions(task: Task, leaf: LeafValues, states: States, step: int) -> A
 
 
 def _expanded(task: Task, graph: StateGraph, leaf: LeafValues, step: int) -> tuple[Ints, Floats, Floats, Floats, Floats]:
-    """Expands all nodes of a graph; returns them, the values of what is met, room for new ones and for q, and the rewards."""
+    """Expands all nodes of a graph.
+
+    Returns:
+        (expanded nodes, values of all nodes, arrays to fill with the backed-up values and with q, rewards of the edges).
+    """
     nodes = np.arange(len(graph))
     samples = min(max(SAMPLES_IN_ALL // len(nodes), FEWEST_SAMPLES), MOST_ROW_SAMPLES)
     for begin in range(0, len(nodes), SAMPLED_TOGETHER):
@@ -206,19 +210,19 @@ def _expanded(task: Task, graph: StateGraph, leaf: LeafValues, step: int) -> tup
 
 
 def _fit(task: Task, states: States, leaf: LeafValues, number: int) -> LeafValues:
-    """Values fitted on states int64 [N, F], distinct, from the given ones on."""
+    """Values fitted on distinct states int64 [N, F], starting from the values ``leaf``."""
     graph = StateGraph(task.model)
     graph.add(states, np.zeros(len(states), dtype=np.int64))
-    nodes, v, found, q, rewards = _expanded(task, graph, leaf, (ITERATIONS + number) * EPISODE_STEPS)
+    nodes, v, targets, q, rewards = _expanded(task, graph, leaf, (ITERATIONS + number) * EPISODE_STEPS)
     if rewards.min() == rewards.max():
         return LOWEST_KNOWN
     low, high = (float(end) / (1.0 - task.gamma) for end in (min(rewards.min(), 0.0), max(rewards.max(), 0.0)))
     regression = PairRegression(graph.states[nodes], task.model.cardinalities, graph.states, low, high)
-    moved = CONVERGED * float(np.abs(rewards).max())
+    tolerance = CONVERGED * float(np.abs(rewards).max())
     for _ in range(SWEEPS):
-        _back_up(graph.arrays, rewards, task.gamma, nodes, v, q, found)
-        leaf, before = regression.fit(found), v
+        _back_up(graph.arrays, rewards, task.gamma, nodes, v, q, targets)
+        leaf, before = regression.fit(targets), v
         v = regression.values(leaf)
-        if np.abs(v - before).max() <= moved:
+        if np.abs(v - before).max() <= tolerance:
             break
     return leaf if np.isfinite(leaf.mean) and np.isfinite(leaf.weights).all() else LOWEST_KNOWN

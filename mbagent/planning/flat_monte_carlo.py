@@ -1,4 +1,4 @@
-"""Flat Monte Carlo, the paper's basic search (section 4.1): random simulated play after every action."""
+"""Flat Monte Carlo, the paper's basic search (section 4.1): every action is evaluated by random play after it."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from mbagent.planning.value_iteration import score_edges
 from mbagent.types import Actions, Floats, Keys, Reward, States
 from mbagent_envs.random_keys import derive, uniforms
 
-_STRING = 1 << 32
-"""Salt of a string's random numbers: no depth is as large, so no step's numbers are used twice."""
+_SEQUENCE = 1 << 32
+"""Salt of the random numbers of action sequences: larger than any depth, so that no step uses the same numbers."""
 
 
 def random_returns(
@@ -31,13 +31,13 @@ def random_returns(
     """Discounted return of one random rollout from each state.
 
     Args:
-        model: where next states come from.
+        model: transition model.
         goal: reward of each transition.
         states: int64 [B, F].
-        keys: uint64 [B], the rollout's randomness.
-        horizon: steps.
+        keys: uint64 [B], keys of the random numbers.
+        horizon: number of steps.
         gamma: discount of a step.
-        first_actions: int64 [B], else the first action is random too.
+        first_actions: int64 [B]; None: the first action is random, too.
 
     Returns:
         float64 [B].
@@ -60,18 +60,18 @@ def random_returns(
 def forecast_returns(
     model: DirectForecastModel, goal: Reward, states: States, keys: Keys, horizon: int, gamma: float, first_actions: Actions
 ) -> Floats:
-    """Discounted return of one random string of actions from each state, every step forecast from the start (paper 4.2).
+    """Discounted return of one random action sequence from each state, with direct forecasts of every step (paper 4.2).
 
-    Step k's transition begins in a draw of where the first k actions lead, made by the model of k steps, and is itself a
-    draw of the one-step model. Errors do not accumulate over steps. The draws of different steps are not of one and the
-    same future, which a mean of returns does not feel, but their maximum would.
+    The state before step k is a sample of the k-step model, given the first k actions; the step itself is a sample of the
+    one-step model. So errors do not accumulate over steps. Samples of different steps do not belong to one trajectory; this
+    leaves the mean of returns unchanged, but not their maximum.
 
     Args:
-        model: the models of one and of several steps.
+        model: models of one and of several steps.
         goal: reward of each transition.
         states: int64 [B, F].
-        keys: uint64 [B], the string's and the draws' randomness.
-        horizon: steps.
+        keys: uint64 [B], keys of the random numbers of sequences and samples.
+        horizon: number of steps.
         gamma: discount of a step.
         first_actions: int64 [B].
 
@@ -79,26 +79,26 @@ def forecast_returns(
         float64 [B].
     """
     total = np.zeros(len(states))
-    strings = (uniforms(derive(keys, _STRING), horizon) * model.n_actions).astype(np.int64)
-    strings[:, 0] = first_actions
+    sequences = (uniforms(derive(keys, _SEQUENCE), horizon) * model.n_actions).astype(np.int64)
+    sequences[:, 0] = first_actions
     for depth in range(horizon):
         step_keys = derive(keys, depth)
-        reached, over = model.forecast(states, strings[:, :depth], derive(step_keys, 1))
-        alive = np.flatnonzero(~over)
-        here, actions = reached[alive], strings[alive, depth]
-        next_states, _ = model.sample(here, actions, step_keys[alive])
-        total[alive] += gamma**depth * goal(here, actions, next_states)
+        reached, ended = model.forecast(states, sequences[:, :depth], derive(step_keys, 1))
+        alive = np.flatnonzero(~ended)
+        before, actions = reached[alive], sequences[alive, depth]
+        next_states, _ = model.sample(before, actions, step_keys[alive])
+        total[alive] += gamma**depth * goal(before, actions, next_states)
     return total
 
 
 class FlatMonteCarlo:
-    """Simulates random play after every action and takes the action whose simulations did best.
+    """Simulates random play after every action and takes the action with the best simulations.
 
     "Several simulations are rolled out up to a bounded number of steps using the transition sampling method. At the end
     of each simulation the reward is counted, and the action which produced the greatest reward is selected."
-    By default an action is judged by the mean of its simulations; ``choice="greatest"`` is the paper's wording, which
-    seeks risk wherever the world is stochastic. What the few simulations of an action do not happen to draw has no part in its
-    value, so outcomes that are rare and decide are missed here; the other planners list them.
+    By default the value of an action is the mean return of its simulations; ``choice="greatest"`` follows the paper's wording,
+    which is risk-seeking in stochastic environments. Outcomes that none of the few simulations of an action samples do not
+    affect its value, so rare but decisive outcomes are missed; the other planners list them.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
@@ -116,9 +116,9 @@ class FlatMonteCarlo:
         self._goal = goal
 
     def plan(self, roots: States) -> Plan:
-        """See Planner. The simulations are shared out evenly over the actions.
+        """See Planner. Every action gets the same number of simulations.
 
-        With a time budget there are rounds of ``wave`` simulations until the next would not be done in time.
+        With a time budget, rounds of ``wave`` simulations run until the next one would exceed it.
         """
         if self._model is None or self._goal is None:
             raise RuntimeError("The planner has no model or no goal yet; call set_model and set_goal first.")
@@ -136,29 +136,29 @@ class FlatMonteCarlo:
         return Plan(best_actions(values), values, np.full(values.shape, float(done)))
 
     def _returns(self, roots: States, done: int) -> Floats:
-        """Discounted returns [R, A, simulations for an action] of one round, after ``done`` others of each action."""
+        """Discounted returns [R, A, simulations of an action] of one round, after ``done`` simulations of each action."""
         model, goal, settings = self._model, self._goal, self.settings
         assert model is not None
-        assert goal is not None  # ``plan`` has seen to both
+        assert goal is not None  # ``plan`` has checked both
         n_actions = model.n_actions
         each = max(1, (settings.num_simulations if settings.time_budget is None else settings.wave) // n_actions)
         rows = np.repeat(np.arange(len(roots)), n_actions * each)
         actions = np.tile(np.repeat(np.arange(n_actions), each), len(roots))
-        # Simulation k meets the same luck under every action.
+        # Common random numbers: simulation k uses the same ones for every action.
         noise = derive(settings.seed, np.arange(done, done + each))
         keys = np.tile(noise, len(roots) * n_actions)
-        given = (goal, roots[rows], keys, settings.horizon, settings.gamma, actions)
+        arguments = (goal, roots[rows], keys, settings.horizon, settings.gamma, actions)
         if settings.forecasts == "direct":
-            returns = forecast_returns(direct_model(model), *given)
+            returns = forecast_returns(direct_model(model), *arguments)
         else:
-            returns = random_returns(model, *given)
+            returns = random_returns(model, *arguments)
         return returns.reshape(len(roots), n_actions, each)
 
     def trace(self, root: States) -> PlanTrace:
-        """What the plan from one root [1, F] rests on; as there is no behaviour but random play, futures are one step long."""
+        """Trace of the plan from one root [1, F]; since play is random after one step, its trajectories have one step."""
         plan, model, goal = self.plan(root), self._model, self._goal
         assert model is not None
-        assert goal is not None  # ``plan`` has seen to both
+        assert goal is not None  # ``plan`` has checked both
         graph = StateGraph(model)
         node = graph.add(root, np.zeros(1, dtype=np.int64))
         graph.expand(node, self.settings.n_samples, self.settings.seed)
@@ -166,14 +166,14 @@ class FlatMonteCarlo:
 
 
 def direct_model(model: TransitionModel) -> DirectForecastModel:
-    """The model, if it forecasts several steps directly.
+    """The model itself, if it has direct forecasts of several steps.
 
     Raises:
-        ValueError: it does not.
+        ValueError: it has none.
     """
     if not isinstance(model, DirectForecastModel):
         raise ValueError(
-            f"forecasts='direct' needs a model with forecasts of several steps, not a {type(model).__name__}; "
+            f"forecasts='direct' needs a model with direct forecasts of several steps, not a {type(model).__name__}; "
             "give the agent model='direct'."
         )
     return model

@@ -1,11 +1,11 @@
-"""Tree search on a lookahead machine: long runs of compiled simulations, stopped only where the machine must be grown.
+"""Tree search on a lookahead: long runs of compiled simulations, interrupted only to expand further states.
 
-Trial-based heuristic tree search (Keller and Helmert 2013) with transpositions: actions by upper confidence bounds (Auer et al.
-2002), successors by chance, Bellman backups on the way back. A simulation ends at a state that is not expanded yet, at the end of
-the episode, or after ``horizon`` steps. Simulations run in waves that grow with what was done; those of a wave see each other's
-visits, not yet their values ("watch the unobserved", Liu et al. 2020). A wave that met no unexpanded state needs neither model
-nor goal, so that the next begins at once, in the same compiled call.
-Shapes: N nodes, M edges, A actions, F factors, R roots, W simulations in a wave, H horizon.
+Trial-based heuristic tree search (Keller and Helmert 2013) with transpositions: actions are selected by upper confidence bounds
+(Auer et al. 2002), successors are sampled, and Bellman backups follow the path back. A simulation ends at an unexpanded state, at
+the end of the episode, or after ``horizon`` steps. Simulations run in batches whose size grows with the number of simulations
+done; those of a batch see each other's visits, but not yet their values ("watch the unobserved", Liu et al. 2020). A batch that
+reaches no unexpanded state needs neither model nor goal, so the next one follows in the same compiled call.
+Shapes: N nodes, M edges, A actions, F factors, R roots, W simulations in a batch, H horizon.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from mbagent_envs.jit import borrowed, compiled, inlined
 from mbagent_envs.random_keys import derive, derive_one, mix
 
 FIRST_SWEEPS, GROWING_SWEEPS, GRAPH_FINAL_SWEEPS = 10, 3, 100
-"""Sweeps of value iteration, at most: before the first simulation, after each growth of the machine, after the last one."""
+"""Maximum number of sweeps of value iteration: before the first simulation, after each expansion, after the last simulation."""
 
 GRAPH_LEAF_SAMPLES = 4
-"""Draws for each (state, action) of a node that the search adds."""
+"""Number of samples for each (state, action) of a node that the search expands."""
 
 FIRST_WAVE, WAVE_SHARE = 8, 4
-"""The first wave's simulations; later ones are at most one for so many that went before."""
+"""Simulations of the first batch; the size of later ones is at most the number of earlier simulations divided by WAVE_SHARE."""
 
 _GRAPH_SALT = 0x6EA6C4
 _GRAPH_STEP = np.uint64(0x9E3779B97F4A7C15)
@@ -39,7 +39,7 @@ _GRAPH_UNIT = 2.0**-53
 
 
 class Tables(NamedTuple):
-    """What a search knows of a graph, with room to grow.
+    """Statistics of a search on a graph, with spare capacity.
 
     Attributes:
         v, q, rewards, frontier: see ``value_iteration.Values``.
@@ -47,9 +47,9 @@ class Tables(NamedTuple):
         met: simulations through each node, int64 [room].
         weight: probability of an edge times discount, 0 where the episode ends, [room].
         income: expected reward of each (node, action), [room, A].
-        path: nodes and actions that the wave's simulations passed through, int64 [R, W, H, 2].
+        path: nodes and actions on the paths of the batch's simulations, int64 [R, W, H, 2].
         lengths: of the paths, int64 [R, W].
-        leaves: unexpanded nodes that the wave met, each once, int64 [R * W].
+        leaves: distinct unexpanded nodes that the batch reached, int64 [R * W].
         spans: range of the values of the expanded nodes around each root, [R].
         root_visits: simulations through the roots' actions, [R, A].
     """
@@ -70,15 +70,15 @@ class Tables(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """How to search; see PlannerSettings.
+    """Parameters of a search; see PlannerSettings.
 
     Attributes:
         n_simulations: for each root.
-        wave: simulations of a root in a wave, at most.
+        wave: maximum number of simulations of a root in a batch.
         gamma: discount of a step.
         c_uct: weight of exploration.
-        prior_visits: visits that a first value counts for.
-        key: of the luck.
+        prior_visits: number of visits that an initial value counts as.
+        key: of the random numbers.
     """
 
     n_simulations: int
@@ -90,13 +90,13 @@ class Rules(NamedTuple):
 
 
 class GraphSearch(ValueIterationPlanner):
-    """UCT on lookahead machines around the roots, for thousands of simulations.
+    """UCT on lookaheads around the roots, for thousands of simulations.
 
-    Every search starts from the values of a lookahead machine, each counting as ``prior_visits`` visits, and grows it where
-    simulations leave it. ``wave`` bounds the simulations of a root between two calls of the model.
+    Every search starts from the values of a lookahead, each of which counts as ``prior_visits`` visits, and expands it where
+    simulations leave it. ``wave`` bounds the number of simulations of a root between two calls of the model.
 
     Attributes:
-        expanded: successors drawn from the model so far, equal ones of a (state, action) counted once.
+        expanded: number of successors sampled from the model so far; equal ones of a (state, action) are counted once.
     """
 
     expanded = 0
@@ -106,8 +106,8 @@ class GraphSearch(ValueIterationPlanner):
         graph, settings = self._empty_graph(), self.settings
         nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
         grow_lookahead(graph, nodes, settings.lookahead_states, settings.lookahead_samples, settings.horizon, settings.seed)
-        nothing, n_simulations = np.zeros((len(graph), graph.model.n_actions)), settings.num_simulations
-        first = Values(nothing[:, 0].copy(), nothing, score_edges(graph, self._known_goal()), np.zeros(len(roots)))
+        zeros, n_simulations = np.zeros((len(graph), graph.model.n_actions)), settings.num_simulations
+        first = Values(zeros[:, 0].copy(), zeros, score_edges(graph, self._known_goal()), np.zeros(len(roots)))
         settle(graph, first, settings.gamma, FIRST_SWEEPS)
         tables = _tables(graph, first, len(roots), min(settings.wave, n_simulations), settings.horizon)
         weigh(graph.arrays, tables, settings.gamma, 0)
@@ -126,7 +126,7 @@ class GraphSearch(ValueIterationPlanner):
         return Expanded(graph, nodes, solution, tables.root_visits, scores)
 
     def _grown(self, graph: StateGraph, roots: Ints, tables: Tables, n: int, seed: int) -> Tables:
-        """Expands the ``n`` leaves that a wave has met, and takes in what follows from them."""
+        """Expands the ``n`` leaves that a batch reached, and updates the tables."""
         leaves, n_nodes, n_edges = np.sort(tables.leaves[:n]), len(graph), graph.n_edges
         graph.expand(leaves, GRAPH_LEAF_SAMPLES, seed)
         tables = _lengthened(tables, len(graph.arrays.tags), len(graph.arrays.sources))
@@ -162,7 +162,7 @@ def _lengthened(tables: Tables, n: int, m: int) -> Tables:
 
 @compiled
 def weigh(graph: GraphArrays, tables: Tables, gamma: float, first_edge: int) -> None:
-    """Takes in the rewards of the edges from number ``first_edge`` on: whole nodes' edges."""
+    """Computes ``weight`` and ``income`` of the edges from number ``first_edge`` on, which are all edges of their nodes."""
     rewards, weight, income = tables.rewards, tables.weight, tables.income
     node = -1
     for edge in range(first_edge, graph.sizes[1]):
@@ -177,7 +177,7 @@ def weigh(graph: GraphArrays, tables: Tables, gamma: float, first_edge: int) -> 
 
 @compiled
 def measure_spans(graph: GraphArrays, tables: Tables) -> None:
-    """Updates the range of the values around each root, which is that of group r: 1 where they are all alike."""
+    """Updates the range of the values around each root r, those of group r; 1 if all are equal."""
     low, high = np.full(len(tables.spans), np.inf), np.full(len(tables.spans), -np.inf)
     for node in range(graph.sizes[0]):
         if graph.expanded[node]:
@@ -189,7 +189,7 @@ def measure_spans(graph: GraphArrays, tables: Tables) -> None:
 
 @compiled
 def take_in(graph: GraphArrays, tables: Tables, gamma: float, leaves: Ints, n_before: int) -> None:
-    """Values the ``leaves`` that were expanded, and the new nodes from number ``n_before`` on; sweeps over the roots' parts."""
+    """Initialises values of the expanded ``leaves`` and of the nodes from number ``n_before`` on, then sweeps their groups."""
     n, m = graph.sizes[0], graph.sizes[1]
     v, q, rewards, active = tables.v[:n], tables.q[:n], tables.rewards[:m], np.zeros(len(tables.frontier), dtype=np.bool_)
     for node in range(n_before, n):
@@ -208,7 +208,11 @@ def _descend(
     r: int, w: int, root: int, noise: np.uint64, scale: float, prior: int, graph: GraphArrays, top: Floats, below: Floats,
     q: Floats, n: Ints, met: Ints, path: Ints,
 ) -> tuple[int, int, np.uint64]:  # fmt: skip
-    """Simulation w from root r, down to its end; returns its length, the unexpanded node it met or -1, and the luck's state."""
+    """Runs simulation w from root r.
+
+    Returns:
+        (length, the unexpanded node that it reached or -1, state of the random numbers).
+    """
     first, counts, probabilities = graph.first, graph.counts, graph.probabilities
     following, terminated, expanded, n_actions = graph.next_nodes, graph.terminated, graph.expanded, q.shape[1]
     s, length, leaf = root, 0, -1
@@ -218,7 +222,7 @@ def _descend(
         best, a = -np.inf, 0
         for b in range(n_actions):
             score = q[s, b] + factor * below[min(n[s, b] + prior, MOST_VISITS - 1)]
-            # Ties are broken by luck: in a fixed order, simulations may go round the same few states for ever.
+            # Ties are broken at random: in a fixed order, simulations may repeat the same few states for ever.
             if score > best or (score == best and (word >> np.uint64(b % 11)) & np.uint64(1)):
                 best, a = score, b
         n[s, a] += 1
@@ -259,7 +263,7 @@ def _back_up(
 
 @compiled
 def _run_wave(graph: GraphArrays, roots: Ints, t: Tables, rules: Rules, top: Floats, below: Floats, done: int, wave: int) -> int:
-    """Runs a wave down to its ends; returns how many unexpanded nodes it met."""
+    """Runs the simulations of a batch; returns the number of distinct unexpanded nodes that they reach."""
     q, n, met, path, lengths, leaves, n_leaves = t.q, t.n, t.met, t.path, t.lengths, t.leaves, 0
     for r in range(len(roots)):
         root, scale = roots[r], rules.c_uct * t.spans[r]
@@ -270,7 +274,7 @@ def _run_wave(graph: GraphArrays, roots: Ints, t: Tables, rules: Rules, top: Flo
             )
             t.root_visits[r, path[r, w, 0, 1]] += 1.0
             if leaf >= 0 and met[leaf] == 0:
-                met[leaf] = 1  # until it is expanded: listed
+                met[leaf] = 1  # an unexpanded node with this mark is listed already
                 leaves[n_leaves] = leaf
                 n_leaves += 1
     return n_leaves
@@ -278,19 +282,19 @@ def _run_wave(graph: GraphArrays, roots: Ints, t: Tables, rules: Rules, top: Flo
 
 @compiled
 def run_waves(graph: GraphArrays, roots: Ints, tables: Tables, rules: Rules, top: Floats, below: Floats, done: Ints) -> int:
-    """Runs waves until all simulations are done, or one has met nodes that are not expanded.
+    """Runs batches until all simulations are done, or a batch reaches unexpanded nodes.
 
     Args:
-        graph: what was imagined.
+        graph: the state graph.
         roots: int64 [R].
         tables: updated.
         rules: of the search.
-        top: part of the upper confidence bound by total visits, see ``machine_search``.
-        below: part by an action's.
-        done: simulations done, and those of a wave that waits for what it met, int64 [2]; updated.
+        top: factor of the upper confidence bound that depends on total visits, see ``machine_search``.
+        below: factor that depends on an action's visits.
+        done: number of simulations done, and of those in a batch that waits for expansions, int64 [2]; updated.
 
     Returns:
-        how many nodes must be expanded before the search can go on; they stand in ``tables.leaves``. 0: all is done.
+        number of nodes, listed in ``tables.leaves``, to expand before the search can continue; 0 if it is complete.
     """
     graph, t = borrowed(graph), borrowed(tables)
     while True:

@@ -1,6 +1,6 @@
-"""A local MDP around each root: states that are likely to be reached soon, with more draws near the root.
+"""Best-first lookahead: the MDP of the most probable states around each root, with more samples near the root.
 
-Models with compiled kernels grow it in compiled code, with the same result.
+For models with compiled kernels, the expansion is compiled, too, with the same result.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from mbagent_envs.jit import borrowed, compiled
 from mbagent_envs.random_keys import derive, derive_one, uniform_at
 
 LAYER_WIDTH = 32
-"""Draws for a (state, action) are chosen so that a layer's states times draws stay about this many."""
+"""Approximate number of states times samples for each (state, action) in a layer, from which the number of samples follows."""
 
 ABOUT_AS_LIKELY = 0.5
-"""States at least this share as likely as the likeliest are expanded together."""
+"""States whose probability is at least this share of the highest one are expanded together."""
 
 _GRID = np.uint64(0x5EED)
 _FAR = np.int64(2**62)
@@ -28,7 +28,7 @@ _FAR = np.int64(2**62)
 
 @compiled
 def n_draws(layer: int, n_samples: int) -> int:
-    """Draws for each (state, action) of a layer of so many states: a power of two, ``n_samples`` at most."""
+    """Number of samples for each (state, action) of a layer of ``layer`` states: a power of two, at most ``n_samples``."""
     wanted, draws = max(LAYER_WIDTH // max(layer, 1), 1), 1
     if wanted >= n_samples:
         return n_samples
@@ -39,9 +39,9 @@ def n_draws(layer: int, n_samples: int) -> int:
 
 @compiled
 def _next_batch(graph: GraphArrays, nodes: Ints, n: int, reach: Floats, depth: Ints, budget: int, horizon: int) -> int:
-    """Sorts the nodes to expand next to the front of the waiting ``nodes`` [n]; returns how many they are.
+    """Moves the nodes to expand next to the front of the unexpanded ``nodes`` [n]; returns their number.
 
-    They are those about as likely as the likeliest, the likeliest first, then the nearest, then the oldest.
+    These are the nodes with almost the highest probability (ABOUT_AS_LIKELY), sorted by probability, then depth, then number.
     """
     top = 0.0
     for i in range(n):
@@ -85,26 +85,26 @@ def grow_around(
     reach: Floats,
     depth: Ints,
 ) -> int:
-    """Expands the likeliest states around a root until the budget is used up, or there is no room for the next ones.
+    """Expands the most probable states around a root until the budget is used, or the arrays have no room for the next batch.
 
     Args:
         kernel: the model's arrays.
         graph: nodes from number ``begin`` on, and the root, belong to this root.
         root: its node.
-        begin: number of nodes before growing began.
-        budget: states to expand, at most.
-        n_samples: draws near the root.
-        horizon: steps from the root, at most.
-        seed: which random numbers.
-        reach: probability of each node's likeliest path from the root, [room]; kept from one call to the next.
-        depth: least number of steps to it, int64 [room]; likewise.
+        begin: number of nodes before the expansion.
+        budget: maximum number of states to expand.
+        n_samples: number of samples near the root.
+        horizon: maximum number of steps from the root.
+        seed: of the random numbers.
+        reach: probability of each node's most probable path from the root, [room]; kept between calls.
+        depth: minimum number of steps to each node, int64 [room]; kept between calls.
 
     Returns:
-        the budget left; 0 if there is nothing more to do.
+        the remaining budget; 0 if nothing remains to be expanded.
     """
     n_actions = graph.counts.shape[1]
-    made = work_for(kernel, n_samples), room_for_outcomes(n_actions, graph.states.shape[1], n_samples)
-    work_out, kernel, graph = borrowed(made), borrowed(kernel), borrowed(graph)
+    arrays = work_for(kernel, n_samples), room_for_outcomes(n_actions, graph.states.shape[1], n_samples)
+    work_out, kernel, graph = borrowed(arrays), borrowed(kernel), borrowed(graph)
     waiting, chosen, n = np.empty(len(graph.tags), dtype=np.int64), np.empty(budget, dtype=np.int64), 0
     if not graph.expanded[root]:
         reach[root], depth[root] = 1.0, 0
@@ -119,20 +119,20 @@ def grow_around(
         if size == 0:
             budget = 0
             break
-        most = most_outcomes(n_actions, n_samples) * size
-        if graph.sizes[0] + most > len(graph.tags) or graph.sizes[1] + most > len(graph.sources):
+        n_needed = most_outcomes(n_actions, n_samples) * size
+        if graph.sizes[0] + n_needed > len(graph.tags) or graph.sizes[1] + n_needed > len(graph.sources):
             break
         for i in range(size):
             chosen[i] = waiting[i]
         n = _drop(waiting, n, size)
         n = _expand_levels(kernel, work_out, graph, chosen[:size], waiting, n, n_samples, seed, reach, depth)
         budget -= size
-    return budget + 0 * len(made[1].counts)  # what is lent must live until here
+    return budget + 0 * len(arrays[1].counts)  # the borrowed arrays must live until here
 
 
 @compiled
 def _drop(waiting: Ints, n: int, size: int) -> int:
-    """Removes the first ``size`` of ``n`` entries; returns how many are left."""
+    """Removes the first ``size`` of ``n`` entries; returns the number of remaining entries."""
     for i in range(size, n):
         waiting[i - size] = waiting[i]
     return n - size
@@ -151,7 +151,7 @@ def _expand_levels(
     reach: Floats,
     depth: Ints,
 ) -> int:
-    """Expands nodes, depth after depth; adds new ones to the ``n`` that are waiting and returns how many these are."""
+    """Expands nodes by increasing depth; appends new ones to the first ``n`` of ``waiting`` and returns their new number."""
     first_edge, first_node, last = graph.sizes[1], graph.sizes[0], np.int64(-1)
     for _ in range(len(chosen)):
         level, layer = _FAR, 0
@@ -182,26 +182,26 @@ def _expand_levels(
 
 
 def layer_seed(seed: int, depth: int) -> int:
-    """Random numbers of one depth: shared by all states and actions there, so that imagined luck is the same for all."""
+    """Seed for one depth: all states and actions there share random numbers, so that they differ only by their effects."""
     return int(derive(seed, depth)[0])
 
 
 def grow_lookahead(graph: StateGraph, roots: NDArray[np.int64], max_states: int, n_samples: int, horizon: int, seed: int) -> None:
-    """Expands the graph around every root, each in its own group, until a budget a root is used up.
+    """Expands the graph around every root, each in its own group, until the budget of each root is used.
 
-    The likeliest states go first: what the agent's own moves surely lead to is known before luck is followed, so that
-    one event with many outcomes near the root (a new maze, say) does not use up the budget and leave the sure part of
-    the world a blank. Among equally likely states the nearest go first. The draws for each (state, action) shrink from
-    ``n_samples`` near the root to one further on, so that the budget reaches deep: with shared random numbers, states
-    that differ only in what the agent did merge again.
+    The most probable states are expanded first, the nearest first among equally probable ones. So states that the agent's
+    actions reach with certainty come before random ones, and one random event with many outcomes near the root (such as a
+    new maze) does not use the whole budget. The number of samples for each (state, action) decreases from ``n_samples``
+    near the root to one further away, so that the budget suffices for deep states: with shared random numbers, states that
+    differ only by the agent's past actions become equal again.
 
     Args:
-        graph: holds the roots, root g in group g, and nothing else.
+        graph: contains the roots only, root g in group g.
         roots: int64 [R], their nodes.
-        max_states: states expanded for each root, at most (the root itself always is).
-        n_samples: draws near the root.
-        horizon: steps from the root, at most.
-        seed: which random numbers.
+        max_states: maximum number of states expanded for each root (the root itself always is).
+        n_samples: number of samples near the root.
+        horizon: maximum number of steps from the root.
+        seed: of the random numbers.
     """
     if graph.kernel is not None:
         _grow_compiled(graph, roots, max_states, n_samples, horizon, seed)
@@ -221,13 +221,13 @@ def grow_lookahead(graph: StateGraph, roots: NDArray[np.int64], max_states: int,
             draws = _draws(sizes, n_samples)[graph.groups[layer]]
             for n in np.unique(draws):
                 graph.expand(layer[draws == n], int(n), layer_seed(seed, int(level)))
-        reach, depth = _follow(graph, start, reach, depth)
+        reach, depth = _update_reach(graph, start, reach, depth)
 
 
 def _likeliest(
     graph: StateGraph, reach: NDArray[np.float64], depth: NDArray[np.int64], budget: NDArray[np.int64], horizon: int
 ) -> NDArray[np.int64]:
-    """The nodes to expand next: of each group those about as likely as its likeliest, nearest first, within the budget."""
+    """Nodes to expand next, within the budget: of each group as in ``_next_batch``, in the same order."""
     waiting = np.flatnonzero(~graph.expanded & (reach > 0.0) & (depth < horizon))
     groups = graph.groups[waiting]
     top = np.zeros(len(budget))
@@ -239,12 +239,12 @@ def _likeliest(
     return nodes[place_in_group(groups) < budget[groups]]
 
 
-def _follow(
+def _update_reach(
     graph: StateGraph, start: int, reach: NDArray[np.float64], depth: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Reach and depth of all nodes after edges from number ``start`` on were added.
+    """Reach and depth of all nodes after the edges from number ``start`` on were added.
 
-    A node's reach is the probability of its likeliest path from the root, the agent's own choices counting as sure.
+    The reach of a node is the probability of the most probable path from the root, if the agent takes that path's actions.
     """
     alive = ~graph.terminated[start:]
     sources, targets = graph.sources[start:][alive], graph.next_nodes[start:][alive]
@@ -257,14 +257,14 @@ def _follow(
 
 
 def _draws(sizes: NDArray[np.int64], n_samples: int) -> NDArray[np.int64]:
-    """Draws for layers of the given sizes: a power of two (few different values make few model calls), or n_samples."""
+    """Samples for layers of the given sizes: powers of two (few distinct values need few model calls), or n_samples."""
     wanted = np.maximum(LAYER_WIDTH // np.maximum(sizes, 1), 1)
     powers = 2 ** np.floor(np.log2(wanted)).astype(np.int64)
     return np.where(wanted >= n_samples, n_samples, np.minimum(powers, n_samples))
 
 
 def place_in_group(groups: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Running number of each entry within its group."""
+    """Index of each entry within its group."""
     order = np.argsort(groups, kind="stable")
     ordered = groups[order]
     starts = np.flatnonzero(np.r_[True, ordered[1:] != ordered[:-1]]) if len(groups) else np.zeros(0, dtype=np.int64)
@@ -275,17 +275,17 @@ def place_in_group(groups: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _grow_compiled(graph: StateGraph, roots: NDArray[np.int64], max_states: int, n_samples: int, horizon: int, seed: int) -> None:
-    """The same with a model that compiled code can ask: one root after the other."""
+    """``grow_lookahead`` for models with compiled kernels: one root after the other."""
     n_actions = graph.model.n_actions
     for root in roots:
         budget, begin, at_once = max_states, len(graph), 64
         reach, depth = np.zeros(0), np.zeros(0, dtype=np.int64)
         while budget > 0:
-            most = most_outcomes(n_actions, n_samples) * min(budget, at_once)
-            graph.reserve(most, most)
+            n_needed = most_outcomes(n_actions, n_samples) * min(budget, at_once)
+            graph.reserve(n_needed, n_needed)
             more = len(graph.arrays.tags) - len(reach)
             reach, depth = np.append(reach, np.zeros(more)), np.append(depth, np.zeros(more, dtype=np.int64))
             left = grow_around(graph.kernel, graph.arrays, root, begin, budget, n_samples, horizon, seed, reach, depth)
-            if left == budget:  # there was no room for all that are about as likely
+            if left == budget:  # there was no room for the next batch
                 at_once *= 2
             budget = left

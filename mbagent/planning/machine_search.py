@@ -1,8 +1,8 @@
-"""Tree search on a machine that is known with its rewards: many short simulations in one compiled call.
+"""Tree search on an MDP with known transitions and rewards: many short simulations in one compiled call.
 
-Trial-based heuristic tree search (Keller and Helmert 2013) with transpositions: actions by upper confidence bounds (Auer et al.
-2002), successors by chance, Bellman backups with the machine's own probabilities on the way back. A simulation ends at a state
-that none has met before, at the end of the episode, or after ``depth`` steps. Every root is searched from nothing.
+Trial-based heuristic tree search (Keller and Helmert 2013) with transpositions: actions are selected by upper confidence bounds
+(Auer et al. 2002), successors are sampled, and Bellman backups with the exact probabilities follow the path back. A simulation
+ends at a state that no simulation has visited, at the end of the episode, or after ``depth`` steps. No search reuses another's.
 Shapes: S states, A actions, K successors, M edges, R roots.
 """
 
@@ -17,25 +17,25 @@ from mbagent_envs.jit import borrowed, compiled, inlined
 from mbagent_envs.random_keys import derive_one, mix
 
 DEPTH = 3
-"""Steps of a simulation, at most, where nothing else is said."""
+"""Default maximum number of steps of a simulation."""
 
 MOST_VISITS = 1 << 14
-"""Visits beyond this count as so many in the bounds."""
+"""Larger numbers of visits are treated as this number in the bounds."""
 
 _STEP = np.uint64(0x9E3779B97F4A7C15)
 _UNIT = 2.0**-53
 
 
 class KnownMachine(NamedTuple):
-    """A machine in the form that the search reads.
+    """An MDP in the form that the search reads.
 
     Attributes:
         first: where the edges of each (state, action) begin, int64 [S * A + 1].
         following: state that each edge leads to, int64 [M].
-        below: probability of the edges up to and with this one, of the same pair, [M].
+        below: cumulative probability of the pair's edges up to and including this one, [M].
         weight: probability times discount, 0 where the episode ends, [M].
         income: expected reward of each (state, action), [S, A].
-        first_value: what a state is worth that was not met yet, [S].
+        first_value: value of states that were not visited yet, [S].
         over: whether an edge ends the episode, bool [M].
     """
 
@@ -49,12 +49,12 @@ class KnownMachine(NamedTuple):
 
 
 class Searched(NamedTuple):
-    """What was found at the roots.
+    """Results of a search at the roots.
 
     Attributes:
         values: of each action, [R, A].
         visits: simulations through each action, int64 [R, A].
-        steps: successors drawn in all.
+        steps: total number of successors sampled.
     """
 
     values: Floats
@@ -72,7 +72,7 @@ def known_machine(
     n_actions: int,
     gamma: float,
 ) -> KnownMachine:
-    """Prepares a machine, once for a goal.
+    """Prepares an MDP for searches, once for each goal.
 
     Args:
         first: where the edges of each (state, action) begin, int64 [S * A + 1].
@@ -80,7 +80,7 @@ def known_machine(
         probabilities: [M], summing to one over each pair.
         rewards: [M].
         over: whether an edge ends the episode, bool [M].
-        first_value: what states are worth that the search has not met yet, [S].
+        first_value: value of states that the search has not visited yet, [S].
         n_actions: number of actions A.
         gamma: discount of a step.
     """
@@ -94,24 +94,24 @@ def known_machine(
 
 _N = np.arange(MOST_VISITS, dtype=np.float64)
 BOUND_TOP, BOUND_BELOW = np.sqrt(np.log(_N + 1.0)), 1.0 / np.sqrt(np.maximum(_N, 0.5))
-"""Parts of the upper confidence bound, by total visits and by an action's."""
+"""Factors of the upper confidence bound, which depend on total visits and on an action's visits."""
 
 
 def search_machine(
     machine: KnownMachine, roots: Ints, n_simulations: int, seed: int, *, depth: int = DEPTH, c_uct: float = 0.5
 ) -> Searched:
-    """Searches from every root, int64 [R]; what is found at one depends neither on the others nor on their number.
+    """Searches from every root, int64 [R]; the result for a root depends neither on the others nor on their number.
 
     Args:
-        machine: the world and the goal.
-        roots: where to search from.
+        machine: the MDP.
+        roots: states to search from.
         n_simulations: for each root.
-        seed: which random numbers.
-        depth: steps of a simulation, at most.
+        seed: of the random numbers.
+        depth: maximum number of steps of a simulation.
         c_uct: weight of exploration, in units of the range of the values of the root's actions, if they differ.
 
     Raises:
-        ValueError: a root that is no state, a depth or a number of simulations below 1, or a negative seed.
+        ValueError: a root is not a state, depth or number of simulations is below 1, or the seed is negative.
     """
     n_states, n_actions = machine.income.shape
     if len(roots) and not (roots.min() >= 0 and roots.max() < n_states):
@@ -157,12 +157,12 @@ def _search_all(
             steps += taken
         for a in range(n_actions):
             values[r, a] = _worth(root, a, m.first, m.following, m.weight, m.income, v)
-    return steps + 0 * len(owned[1])  # what is lent must live until here
+    return steps + 0 * len(owned[1])  # the borrowed arrays must live until here
 
 
 @inlined
 def _worth(s: int, a: int, first: Ints, following: Ints, weight: Floats, income: Floats, v: Floats) -> float:
-    """Value of an action by those of its successors."""
+    """Value of an action, computed from those of its successors."""
     total = income[s, a]
     pair = s * income.shape[1] + a
     for e in range(first[pair], first[pair + 1]):
@@ -172,7 +172,7 @@ def _worth(s: int, a: int, first: Ints, following: Ints, weight: Floats, income:
 
 @inlined
 def _meet(s: int, m: KnownMachine, q: Floats, v: Floats, n: Ints, met: Ints) -> None:
-    """Values a state that no simulation has met before by its successors' first values."""
+    """Initialises the value of a newly visited state from its successors' values."""
     best = -np.inf
     for a in range(q.shape[1]):
         q[s, a] = _worth(s, a, m.first, m.following, m.weight, m.income, v)
@@ -221,7 +221,7 @@ def _simulate(
     met: Ints,
     path: Ints,
 ) -> tuple[np.uint64, int]:
-    """One simulation; returns the state of the random numbers after it, and how many successors it has drawn."""
+    """Runs one simulation; returns the state of the random numbers after it, and the number of successors sampled."""
     first, following, weight, income, n_actions = m.first, m.following, m.weight, m.income, q.shape[1]
     low, high = q[root, 0], q[root, 0]
     for a in range(1, n_actions):

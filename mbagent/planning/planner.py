@@ -14,37 +14,37 @@ from mbagent.types import Actions, Floats, Reward, States
 
 @dataclass(frozen=True)
 class PlannerSettings:
-    """How planners spend their effort.
+    """Settings of planners.
 
     Attributes:
         num_simulations: simulations for each decision; ignored with a time budget.
-        time_budget: seconds for each decision instead (of a batch: times the number of observations), or None. Simulations go
-            on in waves, one at least, until the next would not be done in time, or MAX_SEARCHED states are imagined. The first
-            decision under a new goal takes longer where it generates and solves the reachable machine; where that is solved, no
-            time is needed. Outcomes then depend on the speed of the machine.
-        gamma: discount of a step, above 0 and below 1: the values of an endless world need an end.
-        horizon: steps a simulation looks ahead, at most.
-        max_states: reachable states up to which the whole machine is solved once, for all decisions.
-        lookahead_states: states imagined around each root where the whole machine is larger than that.
-        n_samples: draws for a (state, action) whose successors are too many to enumerate, in the whole machine.
-        lookahead_samples: the same near a root, where the whole machine is too large.
-        learn_values: whether, where the whole machine is too large, values are learned in imagination, once for each goal. They
-            stand for what lies beyond the lookahead machine; where it plays better in imagination, searches do without them, or
-            begin with ``n_samples`` draws of a first step and these values, without a lookahead machine.
-        leaf_values: "machine" (values of the reachable machine) or "rollouts" (random play).
-        backup: "max" (an action is worth what the best behaviour after it is worth) or "mean" (plain UCT).
-        choice: "mean", or "greatest" as in the paper (flat Monte Carlo only; it seeks risk).
+        time_budget: seconds for each decision instead (for a batch: times the number of observations), or None. At least one
+            batch of simulations runs; further ones follow until the next would exceed the time, or MAX_SEARCHED states are in the
+            graph. The first decision for a new goal takes longer if it generates and solves the reachable MDP; decisions in a
+            solved MDP need no time. Results then depend on the speed of the computer.
+        gamma: discount of a step, above 0 and below 1, so that values are finite in environments without an end.
+        horizon: maximum number of steps that a simulation looks ahead.
+        max_states: if at most this many states are reachable, the reachable MDP is solved once for all decisions.
+        lookahead_states: states expanded around each root if more than ``max_states`` are reachable.
+        n_samples: samples for a (state, action) with too many successors to enumerate, in the reachable MDP.
+        lookahead_samples: the same near a root of a lookahead.
+        learn_values: whether leaf values are learned in simulations, once for each goal, if the reachable MDP is too large. They
+            are the values of unexpanded states of the lookahead. If that performs better in simulations, searches do not use
+            them, or use them directly after a first step with ``n_samples`` samples, without a larger lookahead.
+        leaf_values: "machine" (values of the reachable MDP or lookahead) or "rollouts" (random play).
+        backup: "max" (the value of an action is that of the best policy after it) or "mean" (plain UCT).
+        choice: "mean", or "greatest" as in the paper (flat Monte Carlo only; risk-seeking).
         forecasts: "iterated" (simulations go step by step) or "direct" (flat Monte Carlo only: each step is forecast from
             the root by a model of its own, paper 4.2; needs ``model="direct"`` or another DirectForecastModel).
-        c_uct: weight of the search's exploration, in units of the range of values seen.
-        wave: simulations between two calls of the model.
-        prior_visits: how many visits a value from the machine counts for in the search.
-        reuse_tree: whether a decision begins with what the last one imagined (MctsPolicy, one observation at a time). Dropped at
-            episode starts (``predict(..., episode_start=...)`` tells), with a new goal or new weights, where it holds more than
-            MAX_KEPT states, or too few of what can follow. Outcomes then depend on the decisions before. It hardly helps: in
-            two learned games returns stayed as they were (30 episodes); a decision of 64 simulations took 32% and 18% less time,
-            one of 256 took 20% and 7% more, as kept graphs are larger.
-        seed: which random numbers.
+        c_uct: weight of the search's exploration, in units of the range of values.
+        wave: simulations between two calls of the model: the size of a batch of simulations.
+        prior_visits: number of visits that an initial value counts as in the search.
+        reuse_tree: whether a decision starts from the search of the last one (MctsPolicy, one observation at a time). That is
+            dropped at episode starts (see ``predict(..., episode_start=...)``), with a new goal or new weights, if it has more
+            than MAX_KEPT states, or too few states that can follow. Results then depend on earlier decisions. The benefit is
+            small: in two learned games returns were unchanged (30 episodes); a decision of 64 simulations took 32% and 18% less
+            time, one of 256 took 20% and 7% more, since reused graphs are larger.
+        seed: of the random numbers.
 
     Raises:
         ValueError: a setting is out of range.
@@ -91,7 +91,7 @@ class PlannerSettings:
             object.__setattr__(self, name, float(value))
         if not 0.0 < self.gamma < 1.0:
             raise ValueError(
-                f"gamma must lie between 0 and 1, both excluded, got {self.gamma!r}: the values of worlds without an end need a "
+                f"gamma must lie between 0 and 1, both excluded, got {self.gamma!r}: values of endless episodes need a "
                 "discount below 1; 0.99 is the default."
             )
         self._check_choices()
@@ -116,15 +116,15 @@ class PlannerSettings:
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} must be one of {allowed}, got {getattr(self, name)!r}.")
         if self.leaf_values == "rollouts" and self.backup == "max":
-            raise ValueError("leaf_values='rollouts' needs backup='mean': the maximum of random returns seeks luck.")
+            raise ValueError("leaf_values='rollouts' needs backup='mean': the maximum of random returns is risk-seeking.")
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a planner found for each root.
+    """Result of planning for each root.
 
     Attributes:
-        actions: int64 [B], the best action.
+        actions: int64 [B], the chosen action.
         values: float64 [B, A], estimated discounted return of each action.
         visits: float64 [B, A], simulations through each action.
     """
@@ -135,9 +135,9 @@ class Plan:
 
 
 class Planner(Protocol):
-    """Chooses actions by imagining with a model; the outcome is a pure function of (settings, model, goal, root).
+    """Chooses actions by simulations with a model; the plan is a pure function of (settings, model, goal, root).
 
-    One that can also show what a plan rests on has the method of ``trace.TracingPlanner``.
+    Planners that can also return the state graph of a plan have the method of ``trajectories.TracingPlanner``.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
@@ -145,11 +145,11 @@ class Planner(Protocol):
         ...
 
     def set_model(self, model: TransitionModel, start_states: States) -> None:
-        """Takes a (newly fitted) model and the start states int64 [S, F] seen; every cache is dropped."""
+        """Sets a (newly fitted) model and the observed start states int64 [S, F]; drops all caches."""
         ...
 
     def set_goal(self, goal: Reward) -> None:
-        """Takes a new goal; values of the old one are dropped, what was imagined of the world may stay."""
+        """Sets a new goal; drops the values of the old one, while state graphs may be kept."""
         ...
 
     def plan(self, roots: States) -> Plan:
@@ -158,7 +158,7 @@ class Planner(Protocol):
 
 
 def best_actions(scores: Floats) -> Actions:
-    """The first action [B] whose score [B, A] is the greatest but for rounding errors."""
+    """The first action [B] whose score [B, A] is the greatest up to rounding errors."""
     top = scores.max(axis=1, keepdims=True)
     slack = 1e-9 * abs(scores).max(axis=1, keepdims=True)
     result: Actions = (scores >= top - slack).argmax(axis=1)

@@ -1,7 +1,7 @@
-"""Planners: value iteration on the reachable MDP (paper section 2), and tree search beyond it (paper section 4.1).
+"""Planners: value iteration on the reachable MDP (paper section 2), and tree search if it is too large (paper section 4.1).
 
-Where the whole reachable MDP is small, it is solved once for each reward. Elsewhere a local MDP around each observation is
-solved, and Monte Carlo tree search goes on from its values.
+If the reachable MDP is small, it is solved once for each reward. Otherwise a lookahead around each observation is solved, and
+Monte Carlo tree search starts from its values.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ from mbagent.types import Actions, Floats, Ints, Reward, States
 from mbagent_envs.random_keys import derive
 
 RACED: dict[str, Any] = {"time_budget": None, "reuse_tree": False}
-"""Settings while ways to look ahead are compared: the outcome must hang on neither the clock nor the order."""
+"""Settings during races between lookahead configurations, whose result must depend neither on time nor on earlier decisions."""
 
 ROOTS_AT_ONCE = 16
-"""Roots that are imagined around together; bounds the memory."""
+"""Number of roots that are expanded together; bounds the memory."""
 
 
 class Expanded(NamedTuple):
-    """What was imagined around R roots, and what follows from it.
+    """State graph and values around R roots.
 
     Attributes:
-        graph: root r lies in group r.
+        graph: root r is in group r.
         nodes: int64 [R], the roots.
         solution: values of the graph.
         visits: [R, A], simulations through the roots' actions.
-        scores: [R, A], what the choice goes by.
-        tried: [N, A], simulations through all nodes' actions where behaviour goes by them; None where by values.
+        scores: [R, A], by which actions are chosen.
+        tried: [N, A], simulations through all nodes' actions if the policy is chosen by them; None if by values.
     """
 
     graph: StateGraph
@@ -57,10 +57,10 @@ class Expanded(NamedTuple):
 
 
 class ValueIterationPlanner:
-    """Acts greedily on the values of the reachable machine.
+    """Acts greedily on the values of the reachable MDP.
 
-    Where the machine reachable from the start states has at most ``max_states`` states it is generated once for the
-    model and solved once for each goal. A root outside of it gets a lookahead machine of its own.
+    If at most ``max_states`` states are reachable from the start states, this MDP is generated once for the model and solved
+    once for each goal. For each root outside of it, a lookahead is expanded and solved.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
@@ -72,20 +72,20 @@ class ValueIterationPlanner:
         self._mdp: SolvedMdp | None = None
         self._expanded: StateGraph | None = None
         self._config: LookaheadConfig | None = None
-        self._described = False
+        self._warned = False
 
     def set_model(self, model: TransitionModel, start_states: States) -> None:
-        """See Planner. The machine is generated at the next ``plan``."""
+        """See Planner. The reachable MDP is generated at the next ``plan``."""
         self._model, self._start, self._mdp, self._expanded, self._config = model, start_states, None, None, None
 
     def set_goal(self, goal: Reward) -> None:
-        """See Planner. The machine stays, its values go."""
+        """See Planner. The reachable MDP is kept, its values are dropped."""
         if self._mdp is not None:
-            self._mdp.values = None  # before the goal changes: an interrupt must not leave values of another one
-        self._goal, self._config, self._described = goal, None, False
+            self._mdp.values = None  # before the goal changes, so that an interrupt cannot leave values of another goal
+        self._goal, self._config, self._warned = goal, None, False
 
     def share_config(self, other: ValueIterationPlanner) -> None:
-        """Takes over how another planner of the same model and goal looks ahead, if that has found out."""
+        """Copies the lookahead configuration of another planner of the same model and goal, if that has chosen one."""
         self._config = other._config
 
     def plan(self, roots: States) -> Plan:
@@ -98,39 +98,39 @@ class ValueIterationPlanner:
         if len(known) and mdp.graph is not None and mdp.values is not None:
             values[known] = mdp.values.q[nodes[known]]
             scores[known] = break_ties(mdp.graph, mdp.values.q, nodes[known], self.settings.gamma)
-            self._warn_of_doubt(mdp.bounds, nodes[known], scores[known], values[known])
+            self._warn_of_errors(mdp.bounds, nodes[known], scores[known], values[known])
         unknown = np.flatnonzero(nodes < 0)
         for begin in range(0, len(unknown), ROOTS_AT_ONCE):
-            some = unknown[begin : begin + ROOTS_AT_ONCE]
-            found = self._expand(roots[some])
-            values[some], visits[some], scores[some] = found.solution.q[found.nodes], found.visits, found.scores
-            if not self._described:
+            chunk = unknown[begin : begin + ROOTS_AT_ONCE]
+            found = self._expand(roots[chunk])
+            values[chunk], visits[chunk], scores[chunk] = found.solution.q[found.nodes], found.visits, found.scores
+            if not self._warned:
                 bounds = doubt(found.graph, found.solution, self.settings.gamma)
-                self._warn_of_doubt(bounds, found.nodes, scores[some], values[some])
+                self._warn_of_errors(bounds, found.nodes, scores[chunk], values[chunk])
         return Plan(best_actions(scores), values, visits)
 
-    def _warn_of_doubt(self, bounds: Floats | None, nodes: Ints, scores: Floats, values: Floats) -> None:
-        """Warns, once for each goal, where rare outcomes that have no part in a plan could change it."""
-        if self._described or bounds is None or not undecided(scores, values, bounds[nodes]).any():
+    def _warn_of_errors(self, bounds: Floats | None, nodes: Ints, scores: Floats, values: Floats) -> None:
+        """Warns, once for each goal, if rare outcomes that were merged with others could change the choice of an action."""
+        if self._warned or bounds is None or not undecided(scores, values, bounds[nodes]).any():
             return
-        self._described, settings = True, self.settings
+        self._warned, settings = True, self.settings
         warnings.warn(
-            f"More outcomes are rare than plans have room for, so that others stand for some of them; values may be off by up to "
+            f"There are more rare outcomes than plans can represent, so some of them were merged; values may be off by up to "
             f"{bounds[nodes].max():.3g}, which could change the choice of an action: raise n_samples (now {settings.n_samples}) "
             f"and lookahead_samples (now {settings.lookahead_samples}) in policy_kwargs.",
             stacklevel=2,
         )
 
     def trace(self, root: States) -> PlanTrace:
-        """What the plan from one root [1, F] rests on; see PlanTrace."""
+        """Trace of the plan from one root [1, F]; see PlanTrace."""
         mdp = self._solved_mdp()
         nodes = mdp.find(root)
         if nodes[0] < 0 or mdp.graph is None or mdp.values is None:
             return self._trace_of(self._expand(root), 0)
         graph, solution = mdp.graph, mdp.values
         scores = break_ties(graph, solution.q, nodes, self.settings.gamma)
-        nothing = np.zeros((1, graph.model.n_actions))
-        return self._trace_of(Expanded(graph, nodes, solution, nothing, scores), int(graph.expanded.sum()))
+        zeros = np.zeros((1, graph.model.n_actions))
+        return self._trace_of(Expanded(graph, nodes, solution, zeros, scores), int(graph.expanded.sum()))
 
     def _trace_of(self, found: Expanded, machine_states: int) -> PlanTrace:
         plan = Plan(best_actions(found.scores), found.solution.q[found.nodes], found.visits)
@@ -139,41 +139,41 @@ class ValueIterationPlanner:
         return PlanTrace(plan, found.graph, int(found.nodes[0]), solution.rewards, policy, solution.v, machine_states)
 
     def _expand(self, roots: States) -> Expanded:
-        """Imagines around each root [R, F]; here a lookahead machine, solved, without a search."""
+        """Expands and solves a lookahead around each root [R, F]; no search follows."""
         graph, solution, nodes = self._lookahead(roots)
         scores = break_ties(graph, solution.q, nodes, self.settings.gamma)
         return Expanded(graph, nodes, solution, np.zeros_like(scores), scores)
 
     def _empty_graph(self) -> StateGraph:
-        """A graph for the next roots; what the last one held is gone."""
+        """An empty graph for the next roots, which reuses the memory of the last one."""
         if self._expanded is None:
             self._expanded = StateGraph(self._known_model())
         self._expanded.clear()
         return self._expanded
 
     def _lookahead(self, roots: States) -> tuple[StateGraph, Values, Ints]:
-        """A machine around each root [R, F], solved; root r is in group r. Returns (graph, values, root nodes)."""
+        """A solved lookahead around each root [R, F]; root r is in group r. Returns (graph, values, root nodes)."""
         config, graph, settings = self._chosen_config(), self._empty_graph(), self.settings
         nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
         grow_lookahead(graph, nodes, config.states, config.samples, settings.horizon, settings.seed)
         return graph, solve(graph, self._known_goal(), settings.gamma, len(roots), config.leaf), nodes
 
     def _chosen_config(self) -> LookaheadConfig:
-        """How to look ahead under this goal: as the settings say, with learned values at the edge or instead, if any."""
+        """Lookahead configuration for this goal: that of the settings, or the winner of a race if values are learned."""
         if self._config is None:
             settings, start = self.settings, self._start
-            usual = LookaheadConfig(LOWEST_KNOWN, settings.lookahead_states, settings.lookahead_samples)
+            default = LookaheadConfig(LOWEST_KNOWN, settings.lookahead_states, settings.lookahead_samples)
             if settings.learn_values and start is not None and len(start):
-                usual = self._race(usual, Task(self._known_model(), self._known_goal(), start, settings.gamma, settings.seed))
-            self._config = usual
+                default = self._race(default, Task(self._known_model(), self._known_goal(), start, settings.gamma, settings.seed))
+            self._config = default
         return self._config
 
-    def _race(self, usual: LookaheadConfig, task: Task) -> LookaheadConfig:
-        """Learns values for the goal, and finds out whether plans are best with them at the edge, without or only with them."""
+    def _race(self, default: LookaheadConfig, task: Task) -> LookaheadConfig:
+        """Learns leaf values for the goal; races the lookahead with them, the one without, and the values after one step."""
         settings = self.settings
-        leaf, met = learn_values(task)
+        leaf, visited = learn_values(task)
         if len(leaf.common) == 0:
-            return usual
+            return default
 
         def act(config: LookaheadConfig, states: States) -> Actions:
             self._config = config
@@ -181,9 +181,9 @@ class ValueIterationPlanner:
 
         try:
             self.settings = replace(settings, **RACED)
-            configs = (usual._replace(leaf=leaf), usual, LookaheadConfig(leaf, 1, settings.n_samples))
-            return best_config(replace(task, start=met), configs, act)
-        finally:  # should the goal fail now, it is tried again
+            configs = (default._replace(leaf=leaf), default, LookaheadConfig(leaf, 1, settings.n_samples))
+            return best_config(replace(task, start=visited), configs, act)
+        finally:  # if the goal fails here, the next call races again
             self.settings, self._config = settings, None
 
     def _solved_mdp(self) -> SolvedMdp:
@@ -209,24 +209,23 @@ class ValueIterationPlanner:
 
 
 FINAL_SWEEPS = 100
-"""Sweeps of value iteration, at most, that settle the grown graph after the last simulation."""
+"""Maximum number of sweeps of value iteration on the graph after the last simulation."""
 
 LEAF_SAMPLES = 4
-"""Draws for each (state, action) of a node that the search adds."""
+"""Number of samples for each (state, action) of a node that the search expands."""
 
 MAX_SEARCHED = 100_000
-"""Nodes at which a search with a time budget ends before its time; bounds the memory."""
+"""Number of nodes at which a search ends before its time budget is used; bounds the memory."""
 
-_SEARCH_SALT, _CARRIED_SALT = 0x5EA6C4, 0xCA1212
+_SEARCH_SALT, _REUSE_SALT = 0x5EA6C4, 0xCA1212
 
 
 class MctsPlanner(ValueIterationPlanner):
-    """UCT on a graph of imagined states.
+    """UCT on a state graph.
 
-    With ``leaf_values="mdp"`` the search starts from the values of a lookahead machine around the root, each counting as
-    ``prior_visits`` visits, and goes on growing it where it looks promising; where the whole reachable machine is known and
-    solved there is nothing to search for.
-    With ``leaf_values="rollouts"`` it starts from nothing and values leaves by random play, as textbook UCT does.
+    With ``leaf_values="machine"`` the search starts from the values of a lookahead around the root, each of which counts as
+    ``prior_visits`` visits, and expands promising states further; if the reachable MDP is solved, there is no search.
+    With ``leaf_values="rollouts"`` it starts without values and evaluates leaves by random play, as textbook UCT does.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
@@ -235,7 +234,7 @@ class MctsPlanner(ValueIterationPlanner):
         self._last: _Search | None = None
         self._spare: StateGraph | None = None
         self.settling = 0.0
-        """Seconds that the last search with a time budget took to settle a node, after its simulations."""
+        """Seconds for each node that the final value iteration of the last search with a time budget took."""
 
     def set_model(self, model: TransitionModel, start_states: States) -> None:
         """See Planner."""
@@ -248,7 +247,7 @@ class MctsPlanner(ValueIterationPlanner):
         self._last = None
 
     def forget(self) -> None:
-        """Drops what was kept of the last decision (with ``reuse_tree``)."""
+        """Drops the search of the last decision (kept with ``reuse_tree``)."""
         self._last = None
 
     def plan(self, roots: States) -> Plan:
@@ -268,9 +267,9 @@ class MctsPlanner(ValueIterationPlanner):
         """Searches from each root [R, F]."""
         settings = self.settings
         deadline = None if settings.time_budget is None else time.perf_counter() + len(roots) * settings.time_budget
-        search = self._carried_on(roots) if settings.reuse_tree else None
+        search = self._reused_search(roots) if settings.reuse_tree else None
         if search is None:
-            begin = self._lookahead if settings.leaf_values == "machine" else self._bare_roots
+            begin = self._lookahead if settings.leaf_values == "machine" else self._expanded_roots
             graph, solution, nodes = begin(roots)
             search = _Search(self, graph, _first_tables(solution, nodes), nodes)
         found = search.run(deadline)
@@ -278,9 +277,9 @@ class MctsPlanner(ValueIterationPlanner):
             self._last = search
         return found
 
-    def _carried_on(self, roots: States) -> _Search | None:
-        """The last decision's search, from a new root on; None where it knows too little of it, or is too large."""
-        last, self._last = self._last, None  # should the goal fail now, nothing half done is kept
+    def _reused_search(self, roots: States) -> _Search | None:
+        """The last decision's search, with a new root; None if it has too few states after that, or too many in all."""
+        last, self._last = self._last, None  # if the goal fails now, no incomplete search is kept
         if last is None or len(roots) != 1 or len(last.graph) > MAX_KEPT:
             return None
         root = int(last.graph.find(roots)[0])
@@ -293,55 +292,58 @@ class MctsPlanner(ValueIterationPlanner):
         self._expanded, self._spare = graph, last.graph
         return _Search(self, graph, tables, np.zeros(1, dtype=np.int64), last.decision + 1)
 
-    def _bare_roots(self, roots: States) -> tuple[StateGraph, Values, Ints]:
-        """As ``_lookahead``: the roots with their successors, all worth nothing yet."""
+    def _expanded_roots(self, roots: States) -> tuple[StateGraph, Values, Ints]:
+        """As ``_lookahead``, but only the roots are expanded, and all values are 0."""
         graph = self._empty_graph()
         nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
         graph.expand(nodes, self.settings.n_samples, self.settings.seed)
-        nothing = np.zeros((len(graph), graph.model.n_actions))
+        zeros = np.zeros((len(graph), graph.model.n_actions))
         rewards = score_edges(graph, self._known_goal())
-        return graph, Values(nothing[:, 0].copy(), nothing, rewards, np.zeros(len(roots))), nodes
+        return graph, Values(zeros[:, 0].copy(), zeros, rewards, np.zeros(len(roots))), nodes
 
 
 class _Search:
-    """One batch of searches, one for each root; the roots' parts of the graph do not touch."""
+    """Searches for a batch of roots, one for each; no edge connects the groups of different roots."""
 
     def __init__(self, planner: MctsPlanner, graph: StateGraph, tables: Tables, roots: Ints, decision: int = 0) -> None:
         self.planner, self.graph, self.tables, self.roots, self.decision = planner, graph, tables, roots, decision
         settings = self.settings = planner.settings
         rollouts = settings.leaf_values == "rollouts"
         prior = 0.0 if rollouts else settings.prior_visits
-        # What is carried on must not meet the very luck that it was made of.
-        key = derive(settings.seed, _CARRIED_SALT, decision)[0] if decision else _key(settings.seed, 0)
+        # A reused tree must not see the random numbers that it was built with.
+        key = derive(settings.seed, _REUSE_SALT, decision)[0] if decision else _key(settings.seed, 0)
         self.rules = Rules(settings.gamma, settings.c_uct, prior, rollouts, settings.backup == "mean", key)
         if not (rollouts and decision):
             measure_spans(graph.arrays, roots, self.tables)
 
     def run(self, deadline: float | None = None) -> Expanded:
-        """Runs all simulations, or those that there is time for; ``deadline`` is a value of ``time.perf_counter``."""
+        """Runs all simulations, or as many as fit before ``deadline``, a value of ``time.perf_counter``."""
         if deadline is not None:
             return self._run_until(deadline)
         settings, done = self.settings, 0
-        wave = min(settings.wave, settings.num_simulations)
-        paths, leaves = empty_paths(len(self.roots), wave, settings.horizon), np.empty(2 * len(self.roots) * wave, dtype=np.int64)
+        size = min(settings.wave, settings.num_simulations)
+        paths, leaves = (
+            empty_paths(len(self.roots), size, settings.horizon),
+            np.empty(2 * len(self.roots) * size, dtype=np.int64),
+        )
         while done < settings.num_simulations:
-            if settings.num_simulations - done < wave:
-                wave = settings.num_simulations - done
-                paths = empty_paths(len(self.roots), wave, settings.horizon)
+            if settings.num_simulations - done < size:
+                size = settings.num_simulations - done
+                paths = empty_paths(len(self.roots), size, settings.horizon)
             self._run_batch(paths, leaves, done)
-            done += wave
+            done += size
         return self._result()
 
     def _run_until(self, deadline: float) -> Expanded:
-        """Runs waves, one at least, until another one and what comes after the last would not be done in time."""
-        wave, done, now = self.settings.wave, 0, time.perf_counter()
-        paths = empty_paths(len(self.roots), wave, self.settings.horizon)
-        leaves = np.empty(2 * len(self.roots) * wave, dtype=np.int64)
+        """Runs at least one batch; further ones if they and the final value iteration should end before the deadline."""
+        size, done, now = self.settings.wave, 0, time.perf_counter()
+        paths = empty_paths(len(self.roots), size, self.settings.horizon)
+        leaves = np.empty(2 * len(self.roots) * size, dtype=np.int64)
         last = 0.0
         while done == 0 or (now + last + self.planner.settling * len(self.graph) < deadline and len(self.graph) < MAX_SEARCHED):
             began = now
             self._run_batch(paths, leaves, done)
-            done, now = done + wave, time.perf_counter()
+            done, now = done + size, time.perf_counter()
             last = now - began
         found = self._result()
         self.planner.settling = (time.perf_counter() - now) / len(self.graph)
@@ -352,17 +354,17 @@ class _Search:
         n, m, visits = len(graph), graph.n_edges, self.tables.root_visits
         solution = Values(t.v[:n], t.q[:n], t.rewards[:m], t.frontier, t.leaf)
         if self.settings.backup == "mean":
-            return Expanded(graph, roots, solution, visits, visits + 1e-6 * _unit(t.q[roots]), t.visits[:n])
+            return Expanded(graph, roots, solution, visits, visits + 1e-6 * _scaled(t.q[roots]), t.visits[:n])
         settle(graph, solution, self.settings.gamma, FINAL_SWEEPS)
         return Expanded(graph, roots, solution, visits, break_ties(graph, solution.q, roots, self.settings.gamma))
 
     def _run_batch(self, paths: Paths, leaves: Ints, done: int) -> None:
-        """A wave of simulations: one call of the model, one of the goal."""
+        """One batch of simulations: one call of the model and one of the goal."""
         graph, rules = self.graph, self.rules
         n, n_widened = begin_batch(graph.arrays, self.roots, self.tables, rules, done, paths, leaves)
         n_nodes, n_edges, first = len(graph), graph.n_edges, paths.leaves.size
-        draws = self.settings.n_samples if rules.rollouts else LEAF_SAMPLES
-        graph.expand(leaves[:n], draws, int(_key(self.settings.seed, done + 1)))
+        n_samples = self.settings.n_samples if rules.rollouts else LEAF_SAMPLES
+        graph.expand(leaves[:n], n_samples, int(_key(self.settings.seed, done + 1)))
         self._make_room()
         self.tables.rewards[n_edges : graph.n_edges] = score_edges(graph, self.planner._known_goal(), n_edges)
         ends = self._rollouts(paths, done) if rules.rollouts else np.empty(paths.ends.shape)
@@ -370,7 +372,7 @@ class _Search:
         end_batch(graph.arrays, self.roots, self.tables, rules, n_nodes, leaves[:n], widened, paths, ends)
 
     def _make_room(self) -> None:
-        """Lengthens the tables to the graph's length."""
+        """Enlarges the tables to the size of the graph."""
         tables, n, m = self.tables, len(self.graph), self.graph.n_edges
         if len(tables.v) < n:
             v, q, visits, counted = (_longer(table, 2 * n) for table in tables[:4])
@@ -380,7 +382,7 @@ class _Search:
         self.tables = tables
 
     def _rollouts(self, paths: Paths, done: int) -> Floats:
-        """Value [R, W] of the node each simulation ended at, by random play."""
+        """Value [R, W] of the node at which each simulation ended, by random play."""
         values, settings = np.zeros(paths.ends.shape), self.settings
         alive = paths.ends >= 0
         simulation = np.broadcast_to(done + np.arange(paths.ends.shape[1]), paths.ends.shape)[alive]
@@ -401,9 +403,9 @@ def _first_tables(solution: Values, roots: Ints) -> Tables:
 
 
 @lru_cache(maxsize=4096)
-def _key(seed: int, wave: int) -> np.uint64:
-    """Key of the search's luck (0), and of what the wave after ``wave - 1`` simulations imagines."""
-    key: np.uint64 = (derive(seed, _SEARCH_SALT) if wave == 0 else derive(seed, _SEARCH_SALT, wave))[0]
+def _key(seed: int, number: int) -> np.uint64:
+    """Key of the search's random numbers (0), and of the expansions of the batch after ``number - 1`` simulations."""
+    key: np.uint64 = (derive(seed, _SEARCH_SALT) if number == 0 else derive(seed, _SEARCH_SALT, number))[0]
     return key
 
 
@@ -413,8 +415,8 @@ def _longer(table: NDArray[np.float64], size: int) -> Floats:
     return longer
 
 
-def _unit(values: Floats) -> Floats:
-    """Values [R, A] brought to 0 ... 1 by row, for breaking ties."""
+def _scaled(values: Floats) -> Floats:
+    """Values [R, A], each row scaled to 0 ... 1, for breaking ties."""
     low, high = values.min(axis=1, keepdims=True), values.max(axis=1, keepdims=True)
-    unit: Floats = (values - low) / np.maximum(high - low, 1e-12)
-    return unit
+    scaled: Floats = (values - low) / np.maximum(high - low, 1e-12)
+    return scaled

@@ -1,4 +1,4 @@
-"""Trying ways to look ahead in imagination, and taking another than the first only where it plays better."""
+"""Racing of lookahead configurations in simulated episodes: a later one replaces the best so far only if it is clearly better."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from mbagent.types import Actions, Floats, States
 from mbagent_envs.random_keys import derive
 
 RACED_EPISODES = 12
-"""Episodes that each way is tried in; the luck is the same for all ways."""
+"""Number of simulated episodes for each configuration; all configurations share the random numbers."""
 
 MOST_BLOCKS, BLOCK_STEPS = 5, 4
-"""They are played in blocks of so many steps, until one way is clearly better."""
+"""Maximum number of blocks of simulated steps, and steps of a block; a comparison can end after each block."""
 
 CLEARLY = 1.5
-"""Standard errors by which a way must beat the best before it in the end."""
+"""Number of standard errors by which a configuration must be better than the best so far in the end."""
 
 SURELY = 3.0
-"""Standard errors of a difference at which no more is played."""
+"""Number of standard errors of a positive difference at which a comparison ends early."""
 
 HOPELESS = 0.5
-"""Standard errors by which a way is behind when it is given up."""
+"""Number of standard errors of a negative difference at which a configuration is rejected early."""
 
 _SALT = 0x4EE8
 
 
 class LookaheadConfig(NamedTuple):
-    """How a planner looks ahead where it cannot solve the whole machine.
+    """Configuration of a planner's lookahead, used if the reachable MDP is too large to solve.
 
     Attributes:
-        leaf: what unexpanded states are worth.
-        states: states imagined around a root before the search.
-        samples: draws for each (state, action) near it.
+        leaf: values of unexpanded states.
+        states: number of states expanded around a root before the search.
+        samples: number of samples for each (state, action) near the root.
     """
 
     leaf: LeafValues
@@ -49,12 +49,12 @@ Act: TypeAlias = Callable[[LookaheadConfig, States], Actions]
 
 
 def best_config(task: Task, configs: Sequence[LookaheadConfig], act: Act) -> LookaheadConfig:
-    """The way that earns most in imagined play; in doubt the earlier one.
+    """The configuration with the highest return in simulated episodes; without a clear difference the earlier one.
 
     Args:
-        task: model, goal, states to start from, discount and seed.
-        configs: another than the first must clearly beat the best before it.
-        act: chooses actions in a way.
+        task: model, goal, start states, discount and seed.
+        configs: each one after the first must be clearly better than the best before it.
+        act: chooses actions with a configuration.
     """
     best, *others = (_Trial(task, config, act) for config in configs)
     for other in others:
@@ -64,19 +64,19 @@ def best_config(task: Task, configs: Sequence[LookaheadConfig], act: Act) -> Loo
 
 
 def _plays_better(other: _Trial, best: _Trial) -> bool:
-    """Whether one way clearly earns more than another; no more is played than it takes to tell."""
+    """Whether the return of ``other`` is clearly higher than that of ``best``; ends as soon as the result is clear."""
     gain, error = 0.0, 0.0
     for n_blocks in range(1, MOST_BLOCKS + 1):
         gains = other.returns(n_blocks) - best.returns(n_blocks)
         gain, error = float(gains.mean()), float(gains.std(ddof=1)) / RACED_EPISODES**0.5
-        alike = n_blocks > 1 and not gains.any()
-        if alike or gain < -HOPELESS * error or gain > SURELY * error:
+        identical = n_blocks > 1 and not gains.any()
+        if identical or gain < -HOPELESS * error or gain > SURELY * error:
             break
     return gain > CLEARLY * error
 
 
 class _Trial:
-    """Expanded episodes from start states, played in one way."""
+    """Simulated episodes from start states with one configuration."""
 
     def __init__(self, task: Task, config: LookaheadConfig, act: Act) -> None:
         self.config, self._task, self._act = config, task, act
@@ -85,19 +85,19 @@ class _Trial:
         self._alive, self._total = np.arange(RACED_EPISODES), [np.zeros(RACED_EPISODES)]
 
     def returns(self, n_blocks: int) -> Floats:
-        """Discounted return [RACED_EPISODES] of each episode after so many blocks; one that has ended earns nothing more."""
+        """Discounted return [RACED_EPISODES] of each episode after ``n_blocks`` blocks, or at its end if that is earlier."""
         while len(self._total) <= n_blocks * BLOCK_STEPS:
-            self._play()
+            self._step()
         return self._total[n_blocks * BLOCK_STEPS]
 
-    def _play(self) -> None:
-        """One step of all episodes that go on."""
+    def _step(self) -> None:
+        """Simulates one step of all episodes that have not ended."""
         step, total = len(self._total) - 1, self._total[-1].copy()
         self._total.append(total)
         if len(self._alive) == 0:
             return
         task, states = self._task, self._states
         actions = self._act(self.config, states)
-        after, over = task.model.sample(states, actions, derive(task.seed, _SALT, step, self._alive))
-        total[self._alive] += task.gamma**step * task.goal(states, actions, after)
-        self._alive, self._states = self._alive[~over], after[~over]
+        next_states, terminated = task.model.sample(states, actions, derive(task.seed, _SALT, step, self._alive))
+        total[self._alive] += task.gamma**step * task.goal(states, actions, next_states)
+        self._alive, self._states = self._alive[~terminated], next_states[~terminated]

@@ -1,8 +1,8 @@
 """Tree search for stochastic models, compiled: select, expand, back up (paper section 4.1).
 
-The "tree" is a graph: a state reached in two ways is one node (a transposition). Every (node, action) keeps several sampled
-successors. Simulations run in batches between two calls of the reward function. Shapes: R roots, W simulations of a batch, H
-horizon, N nodes, M successor edges, A actions, G groups.
+The "tree" is a graph: a state reached on two paths is one node (a transposition). Every (node, action) keeps several sampled
+successors. Simulations run in batches, with one call of the reward function after each. Shapes: R roots, W simulations of a
+batch, H horizon, N nodes, M successor edges, A actions, G groups.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from mbagent_envs.random_keys import uniform_at
 
 
 class Paths(NamedTuple):
-    """What the simulations of one wave passed through.
+    """Paths of the simulations of one batch.
 
     Attributes:
         edges: int64 [R, W, H], successor edges taken, in order.
-        lengths: int64 [R, W], how many of them.
-        leaves: int64 [R, W], the unexpanded node a simulation ended at; -1 where it ended by termination or horizon.
-        ends: int64 [R, W], the node a simulation ended at; -1 after termination.
+        lengths: int64 [R, W], number of edges.
+        leaves: int64 [R, W], the unexpanded node at which a simulation ended; -1 if it ended by termination or horizon.
+        ends: int64 [R, W], the node at which a simulation ended; -1 after termination.
     """
 
     edges: Ints
@@ -36,7 +36,7 @@ class Paths(NamedTuple):
 
 
 def empty_paths(n_roots: int, wave: int, horizon: int) -> Paths:
-    """Room for the paths of one wave."""
+    """Arrays for the paths of one batch."""
     shape = (n_roots, wave)
     ints = np.zeros((*shape, horizon), dtype=np.int64)
     return Paths(ints, np.zeros(shape, np.int64), np.full(shape, -1, np.int64), np.full(shape, -1, np.int64))
@@ -44,14 +44,14 @@ def empty_paths(n_roots: int, wave: int, horizon: int) -> Paths:
 
 @compiled
 def choose(node: int, q: Floats, visits: Floats, prior_visits: float, weight: float) -> int:
-    """The action of ``node`` with the greatest upper confidence bound; one never tried goes first."""
+    """The action of ``node`` with the greatest upper confidence bound, which is infinite for actions without visits."""
     total = prior_visits * q.shape[1] + visits[node].sum()
     best, chosen = -np.inf, 0
     for a in range(q.shape[1]):
-        seen = prior_visits + visits[node, a]
+        n_visits = prior_visits + visits[node, a]
         score = np.inf
-        if seen > 0.0:
-            score = q[node, a] + weight * np.sqrt(np.log(total + 1.0) / seen)
+        if n_visits > 0.0:
+            score = q[node, a] + weight * np.sqrt(np.log(total + 1.0) / n_visits)
         if score > best:
             best, chosen = score, a
     return chosen
@@ -73,15 +73,16 @@ def select(
     leaves: Ints,
     ends: Ints,
 ) -> None:
-    """Runs the wave's simulations of every root from the root to a leaf; fills the last four arguments (see Paths).
+    """Runs the simulations of a batch from every root to a leaf; fills the last four arguments (see Paths).
 
-    Actions by UCB1 (Auer et al. 2002; Kocsis & Szepesvari 2006) with exploration scaled by ``spans`` [R], the range
-    of values seen. Visits are counted on the way down, so that the simulations of a wave spread out; their results come
-    in ``back_up`` ("watch the unobserved", Liu et al. 2020). The luck of simulation k is the same for every root.
+    Actions are selected by UCB1 (Auer et al. 2002; Kocsis & Szepesvari 2006) with exploration scaled by ``spans`` [R], the
+    range of values. Visits are counted on the way down, so that the simulations of a batch spread out; their values follow
+    in ``back_up_max`` or ``back_up_mean`` ("watch the unobserved", Liu et al. 2020). Simulation k uses the same random
+    numbers for every root.
     """
-    n_roots, wave, horizon = edges.shape
+    n_roots, n_simulations, horizon = edges.shape
     for r in range(n_roots):
-        for w in range(wave):
+        for w in range(n_simulations):
             node, length, leaf = roots[r], 0, -1
             while length < horizon:
                 if not graph.expanded[node]:
@@ -114,10 +115,10 @@ def initialise(nodes: Ints, graph: GraphArrays, rewards: Floats, gamma: float, v
 
 @compiled
 def back_up_max(graph: GraphArrays, rewards: Floats, gamma: float, edges: Ints, lengths: Ints, v: Floats, q: Floats) -> None:
-    """Bellman backups along every path, end first: trial-based heuristic tree search (Keller & Helmert 2013)."""
-    n_roots, wave, _ = edges.shape
+    """Bellman backups along every path, from its end to the root: trial-based heuristic tree search (Keller & Helmert 2013)."""
+    n_roots, n_simulations, _ = edges.shape
     for r in range(n_roots):
-        for w in range(wave):
+        for w in range(n_simulations):
             for step in range(lengths[r, w] - 1, -1, -1):
                 node = graph.sources[edges[r, w, step]]
                 v[node] = bellman(node, graph, rewards, gamma, v, q)
@@ -139,13 +140,13 @@ def back_up_mean(
 ) -> None:
     """Running means of the simulated returns: plain UCT (Kocsis & Szepesvari 2006).
 
-    Args beyond those of ``back_up_max``: ``end_values`` [R, W], value of the node a simulation ended
-    at; ``counted`` [N, A], returns averaged so far; ``extremes`` [R, 2], lowest and highest return seen, from which
-    ``spans`` [R] follow. All but the first arguments are updated in place.
+    Args in addition to those of ``back_up_max``: ``end_values`` [R, W], value of the node at which a simulation ended;
+    ``counted`` [N, A], number of averaged returns; ``extremes`` [R, 2], lowest and highest return, from which ``spans`` [R]
+    are computed. ``counted``, ``q``, ``spans`` and ``extremes`` are updated in place.
     """
-    n_roots, wave, _ = edges.shape
+    n_roots, n_simulations, _ = edges.shape
     for r in range(n_roots):
-        for w in range(wave):
+        for w in range(n_simulations):
             total = end_values[r, w]
             for step in range(lengths[r, w] - 1, -1, -1):
                 edge = edges[r, w, step]
@@ -159,23 +160,23 @@ def back_up_mean(
 
 
 WIDENING_SWEEPS = 3
-"""Sweeps of value iteration after a wave that widened the graph."""
+"""Number of sweeps of value iteration after a batch that widened the graph."""
 
 
 class Tables(NamedTuple):
-    """What a search knows of a graph, with room to grow.
+    """Statistics of a search on a graph, with spare capacity.
 
     Attributes:
         v: value of each node, [room].
         q: value of each of its actions, [room, A].
         visits: simulations through each of them, [room, A].
-        counted: returns averaged so far, [room, A].
+        counted: number of averaged returns, [room, A].
         rewards: of each edge, [room].
-        frontier: value of unexpanded nodes, [G].
+        frontier: value of unexpanded nodes without learned values, [G].
         root_visits: simulations through the roots' actions, [R, A].
         spans: range of the values around each root, [R].
-        extremes: lowest and highest return seen, [R, 2].
-        leaf: what is known of unexpanded nodes.
+        extremes: lowest and highest return, [R, 2].
+        leaf: learned values of unexpanded nodes.
     """
 
     v: Floats
@@ -191,15 +192,15 @@ class Tables(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """How to search; see PlannerSettings.
+    """Parameters of a search; see PlannerSettings.
 
     Attributes:
         gamma: discount of a step.
         c_uct: weight of exploration.
-        prior_visits: visits that a first value counts for.
-        rollouts: whether leaves are valued by random play.
-        mean: whether returns are averaged, instead of the best taken.
-        key: of the luck.
+        prior_visits: number of visits that an initial value counts as.
+        rollouts: whether leaves are evaluated by random play.
+        mean: whether backups are means of returns instead of Bellman backups.
+        key: of the random numbers.
     """
 
     gamma: float
@@ -214,19 +215,19 @@ class Rules(NamedTuple):
 def begin_batch(
     graph: GraphArrays, roots: Ints, tables: Tables, rules: Rules, done: int, paths: Paths, leaves: Ints
 ) -> tuple[int, int]:
-    """Runs a wave of simulations down to leaves, after ``done`` others, and writes the nodes to expand to ``leaves`` [2 R W].
+    """Runs a batch of simulations to leaves, after ``done`` earlier ones, and writes the nodes to expand to ``leaves`` [2 R W].
 
-    For every simulation that only went round in known states, the state that has waited longest is widened, instead.
+    For every simulation that visits only expanded states, the oldest unexpanded state is expanded instead (widening).
 
     Returns:
-        how many nodes to expand, ascending, and how many were widened, which stand from ``leaves[R W]`` on.
+        number of nodes to expand, which are sorted, and number of those by widening, which are repeated from ``leaves[R W]`` on.
     """
     select(
         roots, graph, tables.q, tables.visits, tables.spans, rules.prior_visits, rules.c_uct, rules.key, done,
         paths.edges, paths.lengths, paths.leaves, paths.ends,
     )  # fmt: skip
-    n_roots, wave = paths.leaves.shape
-    n, n_widened, first = 0, 0, n_roots * wave
+    n_roots, n_simulations = paths.leaves.shape
+    n, n_widened, first = 0, 0, n_roots * n_simulations
     if not rules.rollouts:
         n_widened = _widen(graph, roots, paths, leaves[first:])
     found = np.empty(2 * first, dtype=np.int64)
@@ -247,11 +248,11 @@ def begin_batch(
 
 @compiled
 def _widen(graph: GraphArrays, roots: Ints, paths: Paths, out: Ints) -> int:
-    """Writes the states that have waited longest, as many for each root as simulations went round; returns how many."""
-    n_roots, wave = paths.leaves.shape
+    """Writes the oldest unexpanded nodes, for each root as many as simulations visited only expanded ones; returns the number."""
+    n_roots, n_simulations = paths.leaves.shape
     allowance, total = np.zeros(n_roots, dtype=np.int64), 0
     for r in range(n_roots):
-        for w in range(wave):
+        for w in range(n_simulations):
             if paths.leaves[r, w] < 0 and paths.ends[r, w] >= 0:
                 allowance[r] += 1
                 total += 1
@@ -282,18 +283,18 @@ def end_batch(
     paths: Paths,
     end_values: Floats,
 ) -> None:
-    """Takes in what a wave has found, once its leaves are expanded and the new edges' rewards are known.
+    """Backs up the values of a batch after its leaves are expanded and the new edges' rewards are known.
 
     Args:
-        graph: what was imagined.
+        graph: the state graph.
         roots: int64 [R].
         tables: updated.
         rules: of the search.
         n_before: number of nodes before the leaves were expanded.
-        leaves: the expanded nodes, ascending.
-        widened: those of them that no path led to.
-        paths: of the wave.
-        end_values: value of the node that each simulation ended at, [R, W]; with ``rules.rollouts`` only.
+        leaves: the expanded nodes, sorted.
+        widened: those of them that were expanded by widening, not reached by a path.
+        paths: of the batch.
+        end_values: value of the node at which each simulation ended, [R, W]; an input only with ``rules.rollouts``.
     """
     n, m = graph.sizes[0], graph.sizes[1]
     v, q, rewards = tables.v[:n], tables.q[:n], tables.rewards[:m]
@@ -303,7 +304,7 @@ def end_batch(
         q[node], tables.visits[node], tables.counted[node] = 0.0, 0.0, 0.0
     if not rules.rollouts:
         initialise(leaves, graph, rewards, rules.gamma, v, q)
-        if len(widened):  # no path leads there yet that a backup would follow
+        if len(widened):  # no path leads there, so no backup would propagate their values
             active = np.zeros(len(tables.frontier), dtype=np.bool_)
             for node in widened:
                 active[graph.groups[node]] = True
@@ -328,7 +329,7 @@ def end_batch(
 
 @compiled
 def measure_spans(graph: GraphArrays, roots: Ints, tables: Tables) -> None:
-    """Updates the range of the values of the expanded states around each root: at least that of the rewards."""
+    """Updates the range of the values of the expanded states around each root: at least that of the expected rewards."""
     n, m, n_groups = graph.sizes[0], graph.sizes[1], len(tables.frontier)
     low, high = np.full(n_groups, np.inf), np.full(n_groups, -np.inf)
     for node in range(n):
@@ -344,14 +345,14 @@ def measure_spans(graph: GraphArrays, roots: Ints, tables: Tables) -> None:
 
 
 MAX_KEPT = 20_000
-"""Nodes taken along, at most; of a larger graph nothing is."""
+"""Maximum number of nodes of a graph that is reused."""
 
 
 @compiled
 def _copy_reachable(old: GraphArrays, new: GraphArrays, root: int, nodes: Ints, edges: Ints) -> None:
-    """Copies what can be reached from ``root`` into an empty graph, breadth first.
+    """Copies the states reachable from ``root`` into an empty graph, breadth first.
 
-    Writes the old number of each new node and edge to ``nodes`` and ``edges``.
+    Writes the old index of each new node and edge to ``nodes`` and ``edges``.
     """
     nodes[add_node(new, old.states[root], old.groups[root])] = root
     done = 0
@@ -369,16 +370,16 @@ def _copy_reachable(old: GraphArrays, new: GraphArrays, root: int, nodes: Ints, 
 
 
 def carry_over(old: StateGraph, tables: Tables, root: int, new: StateGraph) -> Tables:
-    """Copies what a search of one root knows of the states reachable from another of its nodes.
+    """Copies the part of a search with one root that is reachable from another of its nodes.
 
     Args:
         old: the graph of that search.
-        tables: what it found.
-        root: node of ``old`` to begin from.
-        new: another graph of the same model; overwritten, and ``root`` is its node 0.
+        tables: its statistics.
+        root: node of ``old`` that becomes the root.
+        new: another graph of the same model; overwritten, with ``root`` as its node 0.
 
     Returns:
-        the tables of ``new``. Simulations through the new root's actions count as its own.
+        the tables of ``new``. Earlier simulations through the new root's actions count as visits of the root.
     """
     new.clear()
     new.reserve(len(old), old.n_edges)

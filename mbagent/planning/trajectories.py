@@ -1,4 +1,4 @@
-"""What a plan rests on: the imagined graph around one root, and the likeliest futures in it."""
+"""Traces of plans: the state graph around one root, and its most probable trajectories."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class PlanTrace:
-    """What the plan from one root rests on.
+    """The plan from one root, with the state graph that it is based on.
 
     Attributes:
         plan: the plan, of one row.
-        graph: what was imagined; good until the planner plans again.
+        graph: the state graph; valid until the planner plans again.
         root: the root's node.
         rewards: float64 [M], of the graph's successor edges.
-        policy: int64 [N], the action that the best behaviour found takes in each node; -1 where imagination ends.
+        policy: int64 [N], the action of the best policy found in each node; -1 for nodes without successors.
         values: float64 [N], of the graph's states; None with flat Monte Carlo.
-        machine_states: number of states if the whole reachable machine was solved, so that nothing was searched; else 0.
+        machine_states: number of states if the reachable MDP was solved, so that there was no search; else 0.
     """
 
     plan: Plan
@@ -43,21 +43,21 @@ class PlanTrace:
 
 @runtime_checkable
 class TracingPlanner(Protocol):
-    """A planner that can show what its plan rests on."""
+    """A planner that can return the trace of a plan."""
 
     def trace(self, root: States) -> PlanTrace:
-        """What the plan from one root int64 [1, F] rests on; its plan is that of ``plan(root)``."""
+        """Trace of the plan from one root int64 [1, F]; its plan is that of ``plan(root)``."""
         ...
 
 
 def best_policy(graph: StateGraph, q: Floats, gamma: float, tried: Floats | None = None) -> Ints:
-    """The action [N] that each node's best behaviour takes, chosen as at the root; -1 for nodes without successors.
+    """The action [N] of the best policy in each node, chosen as at the root; -1 for nodes without successors.
 
     Args:
-        graph: what was imagined.
+        graph: the state graph.
         q: float64 [N, A], values.
         gamma: discount.
-        tried: [N, A], simulations where they decide; nodes without any count as unknown.
+        tried: [N, A], simulations, if actions are chosen by them; nodes without any get -1.
     """
     policy = np.full(len(graph), -1, dtype=np.int64)
     known = np.flatnonzero(graph.expanded if tried is None else tried.sum(axis=1) > 0.0)
@@ -67,44 +67,44 @@ def best_policy(graph: StateGraph, q: Floats, gamma: float, tried: Floats | None
 
 
 def likeliest_trajectories(trace: PlanTrace, n_futures: int, n_steps: int) -> list[list[list[int]]]:
-    """For every action of the root the likeliest sequences of successor edges, the likeliest first.
+    """For every root action, the ``n_futures`` most probable sequences of successor edges, the most probable first.
 
-    After the first action they follow ``trace.policy``. A sequence ends after ``n_steps`` edges, with the episode,
-    or where imagination ends. The list is exact: sequences are looked for best first, each judged by its own probability
-    times that of its likeliest continuation, which dynamic programming gives.
+    After the first action they follow ``trace.policy``. A sequence ends after ``n_steps`` edges, with the episode, or at a
+    node without successors. The list is exact: a best-first search orders partial sequences by their probability times that
+    of their most probable continuation, which is computed by dynamic programming.
     """
-    chances = _continuation_chances(trace, n_steps)
+    continuations = _continuations(trace, n_steps)
     n_actions = trace.graph.model.n_actions
-    return [list(islice(_in_order(trace, action, chances), n_futures)) for action in range(n_actions)]
+    return [list(islice(_in_order(trace, action, continuations), n_futures)) for action in range(n_actions)]
 
 
-def _continuation_chances(trace: PlanTrace, n_steps: int) -> list[Floats]:
-    """Entry k: probability [N] of each node's likeliest sequence of at most k more edges."""
+def _continuations(trace: PlanTrace, n_steps: int) -> list[Floats]:
+    """Entry k: probability [N] of the most probable sequence of at most k further edges from each node."""
     graph = trace.graph
     followed = np.flatnonzero(graph.actions == trace.policy[graph.sources])
     sources, targets, p = graph.sources[followed], graph.next_nodes[followed], graph.probabilities[followed]
-    chances = [np.ones(len(graph))]
+    continuations = [np.ones(len(graph))]
     for _ in range(n_steps - 1):
-        here = np.where(trace.policy >= 0, 0.0, 1.0)
-        np.maximum.at(here, sources, p * np.where(graph.terminated[followed], 1.0, chances[-1][targets]))
-        chances.append(here)
-    return chances
+        best = np.where(trace.policy >= 0, 0.0, 1.0)
+        np.maximum.at(best, sources, p * np.where(graph.terminated[followed], 1.0, continuations[-1][targets]))
+        continuations.append(best)
+    return continuations
 
 
-def _in_order(trace: PlanTrace, action: int, chances: list[Floats]) -> Iterator[list[int]]:
-    graph, policy, n_steps = trace.graph, trace.policy, len(chances)
+def _in_order(trace: PlanTrace, action: int, continuations: list[Floats]) -> Iterator[list[int]]:
+    graph, policy, n_steps = trace.graph, trace.policy, len(continuations)
     waiting: list[tuple[float, list[int], float]] = []
 
     def begin(path: list[int], probability: float, bound: float, node: int, chosen: int) -> None:
-        """Adds the sequences that go on with an action from a path [k] whose likeliest continuation has probability ``bound``."""
+        """Adds the continuations of a path by an action; ``bound``: probability of the path's most probable full sequence."""
         first = graph.first[node, chosen]
         for edge in range(first, first + graph.counts[node, chosen]):
-            here = probability * graph.probabilities[edge]
-            if here > 0.0:
-                ahead = 1.0 if graph.terminated[edge] else chances[n_steps - 1 - len(path)][graph.next_nodes[edge]]
-                best = here * ahead
-                # Equal but for rounding must be equal: else no path of many alike would be followed to its end.
-                heapq.heappush(waiting, (-(bound if best >= bound * (1.0 - _ROUNDING) else best), [*path, int(edge)], here))
+            joint = probability * graph.probabilities[edge]
+            if joint > 0.0:
+                ahead = 1.0 if graph.terminated[edge] else continuations[n_steps - 1 - len(path)][graph.next_nodes[edge]]
+                best = joint * ahead
+                # Rounding must not make equal probabilities differ: else none of many equal paths would be followed to its end.
+                heapq.heappush(waiting, (-(bound if best >= bound * (1.0 - _ROUNDING) else best), [*path, int(edge)], joint))
 
     begin([], 1.0, 1.0, trace.root, action)
     while waiting:

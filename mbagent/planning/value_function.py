@@ -1,4 +1,4 @@
-"""What states are worth that were imagined, but not looked beyond."""
+"""Value function for unexpanded states: linear in features and in pairs of features."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ from mbagent_envs.jit import compiled
 
 
 class LeafValues(NamedTuple):
-    """A sum over the *columns* that a state has on, and over pairs of them.
+    """A sum over the active features of a state and over pairs of them.
 
-    A column is on where a factor has one certain value other than its common one; C columns in all.
+    Each of the C features is the test whether a factor has one value, other than its commonest.
 
     Attributes:
-        common: common value of each factor, int64 [F]; or empty: an unexpanded state is worth as much as the lowest expanded one.
+        common: commonest value of each factor, int64 [F]; empty if nothing was learned: unexpanded states then have the lowest
+            value of the expanded ones.
         first: where each factor's values begin in ``column``, int64 [F].
-        column: number of the column that each value of each factor is, -1 for none, int64 [sum of cardinalities].
-        mean: worth of a state in which no column is on.
-        weights: what each column adds, [C].
-        pairs: what two columns add together, symmetric, [C, C]; or [0, 0] for nothing.
-        low: a state is worth so much, at least.
-        high: and so much, at most.
+        column: index of the feature of each value of each factor, -1 for none, int64 [sum of cardinalities].
+        mean: value of a state without active features.
+        weights: of each feature, [C].
+        pairs: weights of pairs of features, symmetric, [C, C]; [0, 0] if pairs are not used.
+        low: lower bound of values.
+        high: upper bound of values.
     """
 
     common: Ints
@@ -39,12 +40,12 @@ class LeafValues(NamedTuple):
 _NOTHING = np.zeros(0, dtype=np.int64)
 
 LOWEST_KNOWN = LeafValues(_NOTHING, _NOTHING, _NOTHING, 0.0, np.zeros(0), np.zeros((0, 0)), 0.0, 0.0)
-"""Nothing was learned of unexpanded states."""
+"""No values were learned: unexpanded states have the lowest value of the expanded states around their root."""
 
 
 @compiled
 def features_on(leaf: LeafValues, state: Ints, on: Ints) -> int:
-    """Writes the columns that a state [F] has on to ``on`` [F]; returns how many."""
+    """Writes the active features of a state [F] to ``on`` [F]; returns their number."""
     n = 0
     for f in range(len(state)):
         if state[f] != leaf.common[f]:
@@ -57,7 +58,7 @@ def features_on(leaf: LeafValues, state: Ints, on: Ints) -> int:
 
 @compiled
 def sum_of(leaf: LeafValues, on: Ints) -> float:
-    """What a state with these columns on is worth."""
+    """Value of a state with the active features ``on``."""
     total, paired = leaf.mean, len(leaf.pairs) > 0
     for i in range(len(on)):
         total += leaf.weights[on[i]]
@@ -69,14 +70,14 @@ def sum_of(leaf: LeafValues, on: Ints) -> float:
 
 @compiled
 def leaf_value(leaf: LeafValues, state: Ints) -> float:
-    """What an unexpanded state [F] is worth; something must have been learned."""
+    """Value of a state [F]; not defined for LOWEST_KNOWN."""
     on = np.empty(len(state), dtype=np.int64)
     return sum_of(leaf, on[: features_on(leaf, state, on)])
 
 
 @compiled
 def evaluate(leaf: LeafValues, states: Ints, skipped: Bools, v: Floats) -> None:
-    """Writes the values of states [N, F] to ``v`` [N], but of those that are skipped; nothing where nothing was learned."""
+    """Writes the values of states [N, F] that are not ``skipped`` to ``v`` [N]; does nothing for LOWEST_KNOWN."""
     if len(leaf.common) > 0:
         for node in range(len(v)):
             if not skipped[node]:

@@ -1,4 +1,4 @@
-"""Dynamic programming on a graph of imagined states."""
+"""Value iteration on state graphs."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from mbagent.types import Bools, Floats, Ints, Reward, States
 from mbagent_envs.jit import compiled
 
 TOLERANCE = 1e-7
-"""Sweeps stop when no value moves by more than this share of the largest expected reward."""
+"""Sweeps stop when no value changes by more than this share of the largest expected reward."""
 
 MAX_SWEEPS = 5000
 
 VALUE_TIE = 1e-6
-"""Values closer than this share of the greatest of them are equal: sweeps stop about there."""
+"""Values that differ by less than this share of the greatest are treated as equal; sweeps are about this accurate."""
 
 MAX_NEWS_SWEEPS = 200
 
 
 @dataclass
 class Values:
-    """Solution of a graph under a goal.
+    """Solution of a state graph for a goal.
 
     Attributes:
-        v: float64 [N], value of each state with the best action; of unexpanded ones the frontier's value.
+        v: float64 [N], value of each state with the best action; of unexpanded states by ``leaf`` or ``frontier``.
         q: float64 [N, A], value of each action; zero rows for unexpanded states.
         rewards: float64 [M], reward of every successor edge.
-        frontier: float64 [G], value of unexpanded states in each group where nothing was learned of them.
-        leaf: what they are worth.
+        frontier: float64 [G], value of unexpanded states in each group, if ``leaf`` is LOWEST_KNOWN.
+        leaf: learned values of unexpanded states.
     """
 
     v: Floats
@@ -49,43 +49,43 @@ def score_edges(graph: StateGraph, goal: Reward, start: int = 0) -> Floats:
     if graph.n_edges == start:
         return np.zeros(0)
     sources, next_nodes = graph.sources[start:], graph.next_nodes[start:]
-    states = graph.states  # take: rows three times as fast as by indexing
+    states = graph.states  # take is three times as fast as indexing of rows
     return goal(states.take(sources, axis=0), graph.actions[start:], states.take(next_nodes, axis=0))
 
 
 def solve(graph: StateGraph, goal: Reward, gamma: float, n_groups: int = 1, leaf: LeafValues = LOWEST_KNOWN) -> Values:
     """Value iteration from scratch.
 
-    States that were never expanded are worth what ``leaf`` says; where it says nothing, the lowest of their group's
-    expanded states, found together with the values. Zero would make every cost end, and every income stop, at the edge of
-    what was imagined; the mean would make that edge more attractive than a prize whose sequel is badly imagined, and the
-    agent walk about for ever.
+    Unexpanded states have the values of ``leaf``; with LOWEST_KNOWN, the lowest value of the expanded states of their group,
+    which is determined together with the values. With zero, all costs and income would end at the unexpanded states; with
+    the mean, these could be more attractive than a reward after which few states are expanded, and the agent would walk
+    around for ever.
 
     Args:
-        graph: what was imagined.
-        goal: what is wanted.
+        graph: the state graph.
+        goal: reward function.
         gamma: discount, below one.
         n_groups: groups of the graph are numbered 0 ... n_groups - 1.
-        leaf: what states that were never expanded are worth, if that was learned.
+        leaf: learned values of unexpanded states.
     """
-    nothing = np.zeros((len(graph), graph.model.n_actions))
-    values = Values(nothing[:, 0].copy(), nothing, score_edges(graph, goal), np.zeros(n_groups), leaf)
+    zeros = np.zeros((len(graph), graph.model.n_actions))
+    values = Values(zeros[:, 0].copy(), zeros, score_edges(graph, goal), np.zeros(n_groups), leaf)
     evaluate(leaf, graph.states, graph.expanded, values.v)
     settle(graph, values, gamma)
     return values
 
 
 def settle(graph: StateGraph, values: Values, gamma: float, max_sweeps: int = MAX_SWEEPS, only: Bools | None = None) -> None:
-    """Value iteration from the given values on, in place.
+    """Value iteration that starts from the given values, in place.
 
-    Gauss-Seidel, the last node first: on a graph without cycles one sweep does.
+    Gauss-Seidel updates, last node first: without cycles, one sweep suffices if every node was added before its successors.
 
     Args:
-        graph: what was imagined.
-        values: where to start; updated.
+        graph: the state graph.
+        values: initial values; updated.
         gamma: discount.
-        max_sweeps: sweeps, at most.
-        only: bool [G], the groups to work on; None for all.
+        max_sweeps: maximum number of sweeps.
+        only: bool [G], the groups to update; None for all.
     """
     active = np.ones(len(values.frontier), dtype=np.bool_) if only is None else only.copy()
     sweep(graph.arrays, values.rewards, gamma, TOLERANCE, max_sweeps, active, values.v, values.q, values.frontier, values.leaf)
@@ -107,7 +107,7 @@ def bellman(node: int, graph: GraphArrays, rewards: Floats, gamma: float, v: Flo
 
 @compiled
 def _set_frontier(graph: GraphArrays, active: Bools, lows: Floats, moved: Floats, v: Floats, frontier: Floats) -> None:
-    """Gives the unexpanded states of every active group the lowest value of its expanded ones; updates the last three."""
+    """Sets the unexpanded states of every active group to the lowest value of its expanded ones; updates the last three."""
     for g in range(len(frontier)):
         if active[g]:
             moved[g] = max(moved[g], abs(lows[g] - frontier[g]))
@@ -136,11 +136,11 @@ def sweep(
     """
     n_groups = len(frontier)
     lows = np.full(n_groups, np.inf)
-    # Every group stops by its own measure: its values must not depend on what else is solved in the same call.
+    # Every group has its own stopping criterion: its values must not depend on the other groups of the same call.
     moved, scale = np.zeros(n_groups), np.full(n_groups, 1e-12)
     for s in range(len(v)):
         for a in range(q.shape[1]):
-            expected = 0.0  # of a rare reward only that counts: it may be a thousand times any other
+            expected = 0.0  # expected rewards, since a rare reward may be a thousand times larger than any other
             for e in range(graph.first[s, a], graph.first[s, a] + graph.counts[s, a]):
                 expected += graph.probabilities[e] * rewards[e]
             scale[graph.groups[s]] = max(scale[graph.groups[s]], abs(expected))
@@ -163,17 +163,17 @@ def sweep(
 
 
 def break_ties(graph: StateGraph, q: Floats, roots: Ints, gamma: float) -> Floats:
-    """Scores [R, A] of the roots' actions: their values, but of equally good ones that which leads somewhere new is ahead.
+    """Action scores [R, A]: Q-values, with ties broken in favour of actions that reach unexpanded states sooner.
 
-    Where nothing in sight makes a difference, the best chance is what lies beyond: among behaviours that lose nothing,
-    the one that soonest leads to states not expanded yet. Without this an agent that sees no prize repeats its first
+    If all actions in the graph are equally good, rewards can only be found outside of it. Among optimal policies the score
+    prefers the one that reaches unexpanded states soonest; without this, an agent that sees no reward would repeat its first
     action for ever.
 
     Args:
-        graph: what was imagined.
+        graph: the state graph.
         q: float64 [N, A], values of its actions.
         roots: int64 [R], nodes to score.
-        gamma: discount, here of the steps until something new.
+        gamma: discount, here of the steps until an unexpanded state.
     """
     scores = q[roots].copy()
     top = scores.max(axis=1, keepdims=True)
@@ -181,16 +181,16 @@ def break_ties(graph: StateGraph, q: Floats, roots: Ints, gamma: float) -> Float
     tied = scores >= top - slack
     if (tied.sum(axis=1) < 2).all() or graph.expanded[graph.next_nodes[~graph.terminated]].all():
         return scores
-    news = np.zeros_like(q)
-    _lead_to_news(graph.arrays, q, VALUE_TIE, gamma, MAX_NEWS_SWEEPS, news)
-    found = news[roots]
+    reach = np.zeros_like(q)
+    _reach_unexpanded(graph.arrays, q, VALUE_TIE, gamma, MAX_NEWS_SWEEPS, reach)
+    found = reach[roots]
     scores[tied] = (top + slack * (1.0 + found))[tied]
     return scores
 
 
 @compiled
-def _lead_to_news(graph: GraphArrays, q: Floats, tie: float, gamma: float, max_sweeps: int, news: Floats) -> None:
-    """Fills ``news`` [N, A]: discounted probability of an unexpanded state, by behaviour that is best under ``q``."""
+def _reach_unexpanded(graph: GraphArrays, q: Floats, tie: float, gamma: float, max_sweeps: int, reach: Floats) -> None:
+    """Fills ``reach`` [N, A]: maximum discounted probability of reaching an unexpanded state by policies optimal for ``q``."""
     w = np.where(graph.expanded[: len(q)], 0.0, 1.0)
     active = np.ones(graph.groups[: len(q)].max() + 1, dtype=np.bool_)
     for _ in range(max_sweeps):
@@ -199,15 +199,15 @@ def _lead_to_news(graph: GraphArrays, q: Floats, tie: float, gamma: float, max_s
             g = graph.groups[s]
             if not (active[g] and graph.expanded[s]):
                 continue
-            bar = q[s].max() - tie * max(np.abs(q[s]).max(), 1e-12)
+            threshold = q[s].max() - tie * max(np.abs(q[s]).max(), 1e-12)
             best = 0.0
             for a in range(q.shape[1]):
                 total = 0.0
                 for e in range(graph.first[s, a], graph.first[s, a] + graph.counts[s, a]):
                     if not graph.terminated[e]:
                         total += gamma * graph.probabilities[e] * w[graph.next_nodes[e]]
-                news[s, a] = total
-                if q[s, a] >= bar:
+                reach[s, a] = total
+                if q[s, a] >= threshold:
                     best = max(best, total)
             moved[g] = max(moved[g], abs(best - w[s]))
             w[s] = best
@@ -217,14 +217,14 @@ def _lead_to_news(graph: GraphArrays, q: Floats, tie: float, gamma: float, max_s
 
 
 SLIGHT = 1e-3
-"""Share of the range of values that it is not worth a warning to be off by."""
+"""Errors of values below this share of their range are not worth a warning."""
 
 
 def doubt(graph: StateGraph, values: Values, gamma: float) -> Floats | None:
-    """How far each action's value [N, A] may be off since other rare outcomes stand for some; None where all take part.
+    """Possible error of each action's value [N, A] due to merged rare outcomes; None if no outcomes were merged.
 
-    On each step that is taken to be their probability times the range of all values found, as if those left out were as extreme
-    as the others are; later steps follow the best behaviour. None, too, where all of it is less than ``SLIGHT`` of that range.
+    For each step it is the probability of the outcomes left out times the range of all values, as if their values were as extreme
+    as those of the others; later steps follow the best policy. Also None if all errors are below ``SLIGHT`` of that range.
     """
     if not graph.left_out.any():
         return None
@@ -241,7 +241,7 @@ def doubt(graph: StateGraph, values: Values, gamma: float) -> Floats | None:
 
 @compiled
 def _add_later_doubt(graph: GraphArrays, q: Floats, gamma: float, first: Floats, bounds: Floats) -> None:
-    """Adds to ``bounds`` [N, A], which begins as ``first``, what comes of later steps."""
+    """Adds the errors of later steps to ``bounds`` [N, A], which initially equals ``first``."""
     for _ in range(MAX_NEWS_SWEEPS):
         moved = 0.0
         for s in range(len(q) - 1, -1, -1):
@@ -258,7 +258,7 @@ def _add_later_doubt(graph: GraphArrays, q: Floats, gamma: float, first: Floats,
 
 
 def undecided(scores: Floats, q: Floats, bounds: Floats) -> Bools:
-    """In which rows [R] another action than the chosen one could be best, were values ``q`` [R, A] off by ``bounds``."""
+    """Rows [R] in which another action than the chosen one could be best, given errors ``bounds`` of the values ``q`` [R, A]."""
     rows, best = np.arange(len(q)), best_actions(scores)
     rivals = q + bounds > (q - bounds)[rows, best][:, None]
     rivals[rows, best] = False
@@ -266,22 +266,22 @@ def undecided(scores: Floats, q: Floats, bounds: Floats) -> Bools:
 
 
 DRAWS, MOST_SMALL_SAMPLES = 4_000_000, 256
-"""Draws of a machine in which there is luck, and of each (state, action) pair, at most: a small machine affords more."""
+"""Maximum number of samples of a stochastic MDP, and of one (state, action): small MDPs get more samples for each."""
 
 
 class SolvedMdp:
-    """The finite-state machine reachable from the known start states, solved anew for each goal.
+    """The MDP reachable from the start states, solved for each goal.
 
     Args:
-        model: what generates it.
+        model: transition model.
         start: int64 [B, F], start states.
-        max_states: when more states than this are reachable, the machine is given up (``graph`` is None).
-        n_samples: draws for a (state, action) with too many successors to enumerate.
-        seed: which random numbers those draws use.
+        max_states: if more states are reachable, ``graph`` is None.
+        n_samples: samples for a (state, action) with too many successors to enumerate; more in small MDPs.
+        seed: of the random numbers of these samples.
 
     Attributes:
-        graph: the complete machine, or None.
-        values: its solution under the goal last given, or None.
+        graph: the reachable MDP, or None.
+        values: its solution for the last goal, or None.
         bounds: see ``doubt``.
     """
 
@@ -289,21 +289,21 @@ class SolvedMdp:
         """See the class."""
         graph, complete = grow_reachable(model, start, max_states, n_samples, seed)
         self.graph = graph if complete and len(start) else None
-        more = _affordable(graph, n_samples)
-        if self.graph is not None and more > n_samples:
-            finer, complete = grow_reachable(model, start, max_states, more, seed)
+        n_finer = _affordable(graph, n_samples)
+        if self.graph is not None and n_finer > n_samples:
+            finer, complete = grow_reachable(model, start, max_states, n_finer, seed)
             self.graph = finer if complete else graph
         self.values: Values | None = None
         self.bounds: Floats | None = None
 
     def set_goal(self, goal: Reward, gamma: float) -> None:
-        """Solves the machine for a goal."""
+        """Solves the MDP for a goal."""
         if self.graph is not None:
             self.values = solve(self.graph, goal, gamma)
             self.bounds = doubt(self.graph, self.values, gamma)
 
     def find(self, states: States) -> NDArray[np.int64]:
-        """Nodes [B] of expanded states [B, F]; -1 where a state is not in the machine."""
+        """Nodes [B] of states [B, F]; -1 for states that the graph does not contain or that are not expanded."""
         if self.graph is None:
             return np.full(len(states), -1, dtype=np.int64)
         nodes = self.graph.find(states)
@@ -311,8 +311,8 @@ class SolvedMdp:
 
 
 def _affordable(graph: StateGraph, n_samples: int) -> int:
-    """How many draws for each (state, action) a machine of this size may cost, where there is any luck."""
+    """Number of samples for each (state, action) that DRAWS allows for an MDP of this size, if it is stochastic."""
     if n_samples >= MOST_SMALL_SAMPLES or graph.counts.max(initial=0) <= 1:
         return n_samples
-    each = DRAWS // max(graph.counts.size, 1)
-    return max(n_samples, min(MOST_SMALL_SAMPLES, 1 << max(each, 1).bit_length() - 1))
+    n_affordable = DRAWS // max(graph.counts.size, 1)
+    return max(n_samples, min(MOST_SMALL_SAMPLES, 1 << max(n_affordable, 1).bit_length() - 1))

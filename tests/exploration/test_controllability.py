@@ -1,4 +1,4 @@
-"""Which factors, and which of their values, actions have a say in."""
+"""Tests of controllable factors and of the classes of their values."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ ALONE, DOOR, GUARD, LAMP = 0, 1, 2, 3
 
 
 def ring(n_steps: int, seed: int = 0) -> tuple[Ints, Ints, Ints]:
-    """A place on a ring of six that actions move along, a door that only place 3 opens, a guard who walks by himself, a lamp."""
+    """A position on a ring of six that actions change, a door that only position 3 opens, an uncontrolled guard, and a lamp."""
     rng = np.random.default_rng(seed)
     actions, states = rng.integers(3, size=n_steps), np.zeros((n_steps + 1, 4), dtype=np.int64)
     for t, action in enumerate(actions):
@@ -19,7 +19,7 @@ def ring(n_steps: int, seed: int = 0) -> tuple[Ints, Ints, Ints]:
     return states[:-1], actions, states[1:]
 
 
-def test_a_place_hangs_on_actions_and_what_hangs_on_the_place_is_reached() -> None:
+def test_a_factor_that_depends_on_actions_and_one_that_depends_on_it_are_found() -> None:
     for n_steps in (600, 3000, 2 * MOST_COUNTED_STEPS):
         before, actions, after = ring(n_steps)
         found = find_controllable(before, actions, after, 3)
@@ -29,7 +29,7 @@ def test_a_place_hangs_on_actions_and_what_hangs_on_the_place_is_reached() -> No
         assert sorted(found.classes[ALONE].values()) == list(range(6))
 
 
-def test_what_seldom_changes_is_kept_apart_until_it_can_be_told() -> None:
+def test_values_that_rarely_change_are_kept_apart() -> None:
     before, actions, after = ring(600)
     before[:, LAMP], after[:, LAMP] = np.arange(600) // 100 % 2, np.arange(1, 601) // 100 % 2
     found = find_controllable(before, actions, after, 3)
@@ -39,8 +39,8 @@ def test_what_seldom_changes_is_kept_apart_until_it_can_be_told() -> None:
     np.testing.assert_array_equal(view(before), before[:, [ALONE, LAMP]])
 
 
-def test_values_that_change_into_each_other_whatever_is_done_are_taken_for_one() -> None:
-    rng, n = np.random.default_rng(0), 4000  # five cells with a player (9), whom actions move, and snow (5) that falls and melts
+def test_values_that_change_into_each_other_independently_of_actions_form_a_class() -> None:
+    rng, n = np.random.default_rng(0), 4000  # five cells with a player (9), moved by actions, and random snow (5)
     snow, at = rng.random((n + 1, 5)) < 0.5, np.zeros(n + 1, dtype=np.int64)
     actions = rng.integers(2, size=n)
     for t in range(n):
@@ -49,14 +49,14 @@ def test_values_that_change_into_each_other_whatever_is_done_are_taken_for_one()
     found = find_controllable(cells[:-1], actions, cells[1:], 2)
     assert found.directly.all()
     view = StateAbstraction(found, np.zeros(5, dtype=np.bool_))
-    assert len(np.unique(view(cells), axis=0)) == 5  # where the player is, and no more
-    assert view(np.full((1, 5), 12)).tolist() == [[10] * 5]  # a value never met is none of the known ones
+    assert len(np.unique(view(cells), axis=0)) == 5  # the position of the player only
+    assert view(np.full((1, 5), 12)).tolist() == [[10] * 5]  # an unobserved value is in a class of its own
     assert view.same_as(StateAbstraction(found, np.zeros(5, dtype=np.bool_)))
     assert not view.same_as(StateAbstraction(found, np.ones(5, dtype=np.bool_)))
     assert not view.same_as(None)
 
 
-def test_where_actions_do_nothing_nothing_is_steered() -> None:
+def test_without_effects_of_actions_no_factor_is_controllable() -> None:
     bits = np.random.default_rng(0).integers(2, size=(3000, 30))
     actions = np.random.default_rng(1).integers(4, size=2999)
     found = find_controllable(bits[:-1], actions, bits[1:], 4)
@@ -64,7 +64,7 @@ def test_where_actions_do_nothing_nothing_is_steered() -> None:
     assert not find_reached(found, bits[:-1], actions, bits[1:]).any()
 
 
-def test_very_many_actions_or_values_are_no_harm() -> None:
+def test_many_actions_or_large_values_are_supported() -> None:
     before, actions, after = ring(3000)
     found = find_controllable(before, actions * 1000, after, 4096)
     assert found.directly[ALONE]

@@ -12,7 +12,7 @@ def test_random_actions_are_all_taken_equally_often() -> None:
     assert counts.min() > 900
 
 
-def test_persistent_actions_go_on_for_a_while_in_each_environment() -> None:
+def test_persistent_actions_are_repeated_in_each_environment() -> None:
     rng, exploration = np.random.default_rng(0), PersistentExploration(3, keep=0.9)
     acts = np.stack([exploration.act(np.zeros((4, 1), dtype=np.int64), rng) for _ in range(4000)])
     same = (acts[1:] == acts[:-1]).mean(axis=0)

@@ -1,4 +1,4 @@
-"""Counts of visits, and exploration directed by them."""
+"""Visit counts, and exploration directed by them."""
 
 import itertools
 from collections.abc import Callable
@@ -27,7 +27,7 @@ Step = Callable[[int, int], tuple[int, bool]]
 
 
 def walk(explorer: Exploration, step: Step, n_steps: int, start: Callable[[], int], seed: int = 0) -> list[tuple[int, int]]:
-    """(state, action) of every step that an exploration takes in a small world; ends begin anew."""
+    """(state, action) of every step of an exploration strategy in a small environment, over several episodes."""
     rng, at, taken = np.random.default_rng(seed), start(), []
     for _ in range(n_steps):
         here = np.array([[at]])
@@ -41,31 +41,31 @@ def walk(explorer: Exploration, step: Step, n_steps: int, start: Callable[[], in
 
 
 def chain(n: int, right: Ints) -> Step:
-    """One action of two goes on, which one differs from cell to cell; the other, and the end of the chain, end the episode."""
+    """One of two actions, different from cell to cell, moves on; the other one and the end of the chain terminate the episode."""
     return lambda at, action: (at + 1, at + 1 == n) if action == right[at] else (at, True)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_chain_whose_end_luck_never_meets_is_reached_within_the_square_of_its_length(seed: int) -> None:
+def test_a_chain_whose_end_random_actions_never_reach_is_explored_in_the_square_of_its_length(seed: int) -> None:
     n = 40
     world = chain(n, np.random.default_rng([seed, 1]).integers(2, size=n))
     directed = walk(DirectedExploration(2), world, n * n, lambda: 0, seed)
     assert len(set(directed)) == 2 * n
-    assert max(walk(RandomExploration(2), world, n * n, lambda: 0, seed))[0] < n - 1  # it needs about 2^40 steps
+    assert max(walk(RandomExploration(2), world, n * n, lambda: 0, seed))[0] < n - 1  # random actions need about 2^40 steps
 
 
-def test_where_an_end_is_the_only_way_on_the_episode_is_ended() -> None:
-    rng = np.random.default_rng(0)  # two rooms that only a new episode changes; one is where one episode in ten begins
+def test_episodes_are_ended_if_only_new_ones_reach_new_states() -> None:
+    rng = np.random.default_rng(0)  # the room changes in new episodes only; one of ten begins in the second room
 
     def step(at: int, action: int) -> tuple[int, bool]:
         return at, action == 0
 
     visits = walk(DirectedExploration(3), step, 2000, lambda: int(rng.random() < 0.1))
     rare = np.mean([at == 1 for at, _ in visits])
-    assert rare > 0.3  # random play, which ends a third of the time wherever it is, is there a tenth of the time
+    assert rare > 0.3  # random play ends episodes equally often in both rooms, so its share is a tenth
 
 
-def test_counts_are_those_of_the_transitions_and_a_second_learn_goes_on() -> None:
+def test_counts_are_those_of_the_transitions_and_continue_in_a_second_learn() -> None:
     agent = ModelLearningAgent("MctsPolicy", gym.make("FrozenLake-v1"), seed=0, model="tabular")
     for _ in range(2):
         agent.learn(700, log_interval=None, reset_num_timesteps=False)
@@ -82,26 +82,26 @@ def test_counts_are_those_of_the_transitions_and_a_second_learn_goes_on() -> Non
 
 
 class Rewarded(gym.Wrapper[Any, Any, Any, Any]):
-    """Another reward, for the same world."""
+    """Another reward for the same environment."""
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         obs, _, terminated, truncated, info = self.env.step(action)
         return obs, float(7 * obs), terminated, truncated, info
 
 
-def test_the_same_seed_meets_the_same_whatever_the_reward() -> None:
-    def met(wrap: Callable[[Any], Any]) -> tuple[Ints, Ints]:
+def test_exploration_depends_on_the_seed_but_not_on_the_reward() -> None:
+    def observed(wrap: Callable[[Any], Any]) -> tuple[Ints, Ints]:
         env = wrap(gym.make("FrozenLake-v1"))
         rows = ModelLearningAgent("MctsPolicy", env, seed=3, model="tabular").learn(600, log_interval=None).transitions.rows()
         return rows.states, rows.actions
 
-    first = met(lambda env: env)
-    for other in (met(lambda env: env), met(Rewarded)):
+    first = observed(lambda env: env)
+    for other in (observed(lambda env: env), observed(Rewarded)):
         np.testing.assert_array_equal(first[0], other[0])
         np.testing.assert_array_equal(first[1], other[1])
 
 
-def test_with_more_states_than_a_table_holds_the_default_draws_what_random_exploration_draws() -> None:
+def test_with_too_many_states_the_default_acts_as_random_exploration() -> None:
     explorer, rng = EXPLORATIONS["auto"](4), np.random.default_rng(0)
     assert isinstance(explorer, DirectedExploration)
     bits = np.random.default_rng(1).integers(2, size=(4000, 1, 20))
@@ -113,11 +113,11 @@ def test_with_more_states_than_a_table_holds_the_default_draws_what_random_explo
     many = np.arange(2 * MANY_STATES)[:, None] + np.zeros((1, 20), dtype=np.int64)
     for part in np.array_split(many, 300):
         explorer.observe(part, np.zeros(len(part), dtype=np.int64), part + 1, np.zeros(len(part), dtype=np.bool_))
-    assert explorer.table is None  # for good, and its memory is free
+    assert explorer.table is None  # dropped permanently, with its memory
 
 
 class Lights(gym.Env[Any, Any]):
-    """A chain of which luck never meets the end, with lights beside it that flicker whatever is done."""
+    """A chain whose end random actions never reach, and lights that flicker independently of actions."""
 
     def __init__(self, n: int) -> None:
         self.n, self.right = n, np.random.default_rng(1).integers(2, size=n)
@@ -140,15 +140,15 @@ class Lights(gym.Env[Any, Any]):
 
 
 @pytest.mark.parametrize("copies", [1, 3])
-def test_lights_that_flicker_do_not_hide_where_to_go(copies: int, tmp_path: Any) -> None:
+def test_distractors_do_not_prevent_directed_exploration(copies: int, tmp_path: Any) -> None:
     n = 20
     envs = DummyVecEnv([lambda: Lights(n)] * copies)
     agent = ModelLearningAgent("MctsPolicy", envs, seed=0, model="tabular", reward=lambda *_: np.zeros(len(_[1])))
-    met = set()
-    for _ in range(2):  # called again it goes on
+    pairs = set()
+    for _ in range(2):  # the second call continues the first
         rows = agent.learn(1000, log_interval=None, reset_num_timesteps=False).transitions.rows()
-    met = {(int(at), int(action)) for at, action in zip(rows.states[:, 0], rows.actions, strict=True)}
-    assert len(met) == 2 * n
+    pairs = {(int(at), int(action)) for at, action in zip(rows.states[:, 0], rows.actions, strict=True)}
+    assert len(pairs) == 2 * n
     explorer = agent._explorer
     assert isinstance(explorer, DirectedExploration)
     assert explorer.directed
@@ -156,7 +156,7 @@ def test_lights_that_flicker_do_not_hide_where_to_go(copies: int, tmp_path: Any)
     np.testing.assert_array_equal(explorer.view.factors, [0])
     assert explorer.table is not None
     assert len(explorer.table) == n
-    again = DirectedExploration(2, few=True)  # from a file it knows the same at once
+    again = DirectedExploration(2, few=True)  # the same state after recalling the transitions
     again.recall(rows)
     assert again.table is not None
     assert again.view is not None
@@ -165,7 +165,7 @@ def test_lights_that_flicker_do_not_hide_where_to_go(copies: int, tmp_path: Any)
         np.testing.assert_array_equal(again.table.counts(some), explorer.table.counts(some))
 
 
-def test_after_so_many_values_no_more_are_kept_and_what_was_found_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_beyond_the_limit_of_values_none_are_kept_and_the_abstraction_remains(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mbagent.exploration.strategies.MANY_VALUES", 20_000)
     explorer, rng, right = EXPLORATIONS["auto"](2), np.random.default_rng(0), np.random.default_rng(1).integers(2, size=20)
     assert isinstance(explorer, DirectedExploration)
@@ -182,13 +182,13 @@ def test_after_so_many_values_no_more_are_kept_and_what_was_found_holds(monkeypa
     assert len(tried) == 40
 
 
-def test_copies_in_the_same_state_share_the_untried_actions_out() -> None:
+def test_environments_in_the_same_state_try_different_actions() -> None:
     table = VisitTable(4)
     nodes = table.add(np.zeros((4, 2), dtype=np.int64))
     assert sorted(table.choose(nodes, np.random.default_rng(0).random((4, 4)))) == [0, 1, 2, 3]
 
 
-def test_outcomes_are_counted_apart_as_the_table_grows() -> None:
+def test_outcomes_are_counted_separately_as_the_table_grows() -> None:
     table, rng = VisitTable(2), np.random.default_rng(0)
     states, actions, after = rng.integers(300, size=5000), rng.integers(2, size=5000), rng.integers(5, size=5000)
     for part in np.array_split(np.arange(5000), 50):
@@ -207,7 +207,7 @@ def test_outcomes_are_counted_apart_as_the_table_grows() -> None:
             np.testing.assert_array_equal(found, expected[state, action])
 
 
-def test_transitions_of_a_file_are_known_to_an_agent_that_goes_on(tmp_path: Any) -> None:
+def test_a_loaded_agent_counts_the_saved_transitions(tmp_path: Any) -> None:
     agent = ModelLearningAgent("MctsPolicy", gym.make("FrozenLake-v1"), seed=0, model="tabular").learn(500, log_interval=None)
     agent.save(tmp_path / "agent.zip", include=["transitions"])
     again = ModelLearningAgent.load(tmp_path / "agent.zip", env=gym.make("FrozenLake-v1")).learn(100, log_interval=None)
@@ -217,10 +217,10 @@ def test_transitions_of_a_file_are_known_to_an_agent_that_goes_on(tmp_path: Any)
     assert counts.sum() == again._explorer.n_steps == len(again.transitions) == 600
 
 
-def test_several_copies_are_explored_at_once() -> None:
+def test_several_environments_are_explored_together() -> None:
     envs = DummyVecEnv([lambda: gym.make("CliffWalking-v1", max_episode_steps=200)] * 4)
     agent = ModelLearningAgent("MctsPolicy", envs, seed=0, model="tabular", exploration="directed").learn(1000, log_interval=None)
     explorer = agent._explorer
     assert isinstance(explorer, DirectedExploration)
     assert explorer.table is not None
-    assert explorer.table.pairs() == 37 * 4  # random steps have tried half of that by then
+    assert explorer.table.pairs() == 37 * 4  # random actions have tried half of them by then

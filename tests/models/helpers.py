@@ -48,7 +48,7 @@ def played(game: Game, n_steps: int, episode_length: int, seed: int = 0) -> Tran
 
 
 def outcomes(cardinalities: tuple[int, ...]) -> tuple[Ints, Bools]:
-    """All next states and terminated flags there are."""
+    """All combinations of next state and terminated."""
     every = np.stack(np.unravel_index(np.arange(2 * np.prod(cardinalities)), (*cardinalities, 2)), axis=1)
     return every[:, :-1].astype(np.int64), every[:, -1] == 1
 
@@ -61,7 +61,7 @@ def distribution(model: NeuralTransitionModel, state: Ints, action: int) -> Floa
 
 
 def outcome_numbers(cardinalities: tuple[int, ...], states: Ints, terminated: Bools) -> Ints:
-    """Place of each outcome in ``outcomes``."""
+    """Index of each outcome in ``outcomes``."""
     return np.ravel_multi_index((*states.T, terminated.astype(np.int64)), (*cardinalities, 2)).astype(np.int64)
 
 
@@ -73,7 +73,7 @@ def scrambled(
     seed: int = 0,
     body: Callable[..., torch.nn.Module] | None = None,
 ) -> NeuralTransitionModel:
-    """A model with random weights: all probabilities well away from 0, all dependencies there."""
+    """A model with random weights: all probabilities are well above 0, and all dependencies exist."""
     model = NeuralTransitionModel(cardinalities, n_actions, config or NeuralConfig(hidden=(8,), group_size=4), body=body)
     rng = np.random.default_rng(seed)
     weights = {

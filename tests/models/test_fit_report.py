@@ -1,4 +1,4 @@
-"""The fit report: calibration against a closed form, parents named, a hidden past noticed and a full state left in peace."""
+"""The fit report: calibration against a closed form, names of parents, and the Markov test with and without hidden state."""
 
 import numpy as np
 import pytest
@@ -16,12 +16,12 @@ RNG = np.random.default_rng(0)
 
 def test_calibration_is_the_distance_of_probabilities_from_frequencies() -> None:
     p = np.repeat([0.25, 0.85], 1000)
-    came = np.concatenate([np.arange(1000) < 250, np.arange(1000) < 600])
-    assert calibration_error(p, came) == pytest.approx(0.125)
+    observed = np.concatenate([np.arange(1000) < 250, np.arange(1000) < 600])
+    assert calibration_error(p, observed) == pytest.approx(0.125)
     assert calibration_error(np.ones(4), np.ones(4, dtype=np.bool_)) == 0.0
 
 
-def test_each_variable_is_reported_with_what_it_hangs_on() -> None:
+def test_each_variable_is_reported_with_its_parents() -> None:
     states, actions = RNG.integers(2, size=(1000, 4)), RNG.integers(2, size=1000)
     following = states.copy()
     following[:, 2] = np.where(actions == 1, states[:, 0], states[:, 2])
@@ -39,12 +39,12 @@ def test_each_variable_is_reported_with_what_it_hangs_on() -> None:
 
 
 def swing(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """A place that goes to and fro; which way it goes is not shown."""
+    """A position that moves back and forth; its direction is not observed."""
     place = np.abs((np.arange(n + 1) % 10) - 5)
     return place[:-1], place[1:]
 
 
-def test_a_hidden_past_is_noticed() -> None:
+def test_a_hidden_direction_is_detected() -> None:
     now, then = swing(1200)
     report = DecisionGraphModel((6,), 2).fit(dataset((6,), 2, now[:, None], RNG.integers(2, size=1200), then[:, None]))
     assert report.memory == pytest.approx(0.8 * np.log(2), rel=0.2)
@@ -56,23 +56,23 @@ def test_a_hidden_past_is_noticed() -> None:
     assert LocalGraphModel(space, 2).fit(data).memory == pytest.approx(0.8 * np.log(2), rel=0.2)
 
 
-def test_a_full_state_is_left_in_peace() -> None:
-    place, luck = np.zeros(1201, dtype=np.int64), RNG.integers(-1, 2, size=1200)
+def test_a_complete_state_gives_no_advice() -> None:
+    place, moves = np.zeros(1201, dtype=np.int64), RNG.integers(-1, 2, size=1200)
     for t in range(1200):
-        place[t + 1] = np.clip(place[t] + luck[t], 0, 5)
+        place[t + 1] = np.clip(place[t] + moves[t], 0, 5)
     actions = RNG.integers(2, size=1200)
     report = DecisionGraphModel((6,), 2).fit(dataset((6,), 2, place[:-1, None], actions, place[1:, None], episode_length=1200))
     assert report.memory == 0.0
     assert report.advice is None
 
 
-def test_only_steps_that_follow_another_have_a_past() -> None:
+def test_only_steps_that_follow_another_one_have_a_past() -> None:
     now, then = swing(40)
     rows = dataset((6,), 3, now[:, None], RNG.integers(3, size=40), then[:, None], episode_length=20).rows()
     later, earlier = following_steps(rows)
     assert later.tolist() == [*range(1, 20), *range(21, 40)]
     assert (later - earlier == 1).all()
-    mixed = rows.select(np.arange(40).reshape(2, 20).T.ravel())  # two episodes side by side, as vector environments play them
+    mixed = rows.select(np.arange(40).reshape(2, 20).T.ravel())  # two interleaved episodes, as from vector environments
     assert all((later - earlier == 2).all() for later, earlier in (following_steps(mixed),))
     space, longer = with_past(*steps_in_a_row(rows, 100), (6,), action_encoding((3,)), None)
     assert space.cardinalities == (6, 6, 2, 2, 2)
@@ -81,7 +81,7 @@ def test_only_steps_that_follow_another_have_a_past() -> None:
     np.testing.assert_array_equal(longer.states[:, 2:].argmax(axis=1), rows.actions[earlier])
 
 
-def test_a_velocity_that_is_not_shown_is_noticed_though_an_action_turns_it() -> None:
+def test_a_hidden_velocity_is_detected_although_an_action_reverses_it() -> None:
     place, speed, rows = 0, 1, []
     for action in RNG.integers(2, size=3000).tolist():
         before, speed = place, speed if action == 0 else -speed

@@ -1,4 +1,4 @@
-"""Error estimates: honest on a world that is half known, rising where nothing was seen."""
+"""Error estimates: calibrated with limited data, and higher for unobserved states."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ CARDS = (30, 2)
 
 
 def world(n: int, seed: int) -> TransitionDataset:
-    """A table of thirty places that lead anywhere, low ones met often, and a biased coin."""
+    """A table of thirty places with random transitions, of which low ones are observed often, and a biased coin."""
     rng = np.random.default_rng(seed)
     table = np.random.default_rng(9).integers(30, size=(30, 2))
     place = np.minimum(rng.geometric(0.12, size=n) - 1, 29)
@@ -25,7 +25,7 @@ def world(n: int, seed: int) -> TransitionDataset:
     return dataset(CARDS, 2, states, actions, following)
 
 
-def test_estimated_errors_are_those_met() -> None:
+def test_estimated_errors_are_those_observed() -> None:
     data = world(400, 0)
     model = DecisionGraphModel(CARDS, 2)
     model.fit(data)
@@ -43,7 +43,7 @@ def test_estimated_errors_are_those_met() -> None:
     assert apart[unknown].mean() > apart[known].mean()
 
 
-def test_models_without_a_likeliest_state_of_their_own_have_each_factors() -> None:
+def test_models_without_a_method_for_the_likeliest_state_use_each_factors_likeliest_value() -> None:
     data = world(2000, 0)
     model = TabularModel(CARDS, 2)
     model.fit(data)
@@ -80,16 +80,16 @@ def test_models_without_probabilities_are_refused_before_anything_is_fitted() ->
         estimate_error(build, Unfitted(CARDS, 2), world(400, 0))
 
 
-def test_more_doubt_is_more_within_steps_of_one_rate() -> None:
+def test_calibrated_probabilities_strictly_increase() -> None:
     doubts = np.linspace(0.0, 1.0, 400)
     x, y = _calibrated(doubts, doubts > 0.5)
     assert (np.diff(x) > 0.0).all()
     assert (np.diff(y) > 0.0).all()
     np.testing.assert_allclose(np.interp([0.2, 0.8], x, y), [0.0, 1.0], atol=0.05)
-    x, y = _calibrated(doubts[::-1], doubts > 0.5)  # doubt that misleads tells nothing but the rate
+    x, y = _calibrated(doubts[::-1], doubts > 0.5)  # doubts that mislead leave only the mean rate
     np.testing.assert_allclose(np.interp(doubts, x, y).mean(), 0.5, atol=0.05)
 
 
-def test_too_little_data_is_one_clear_sentence() -> None:
+def test_too_little_data_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 50"):
         estimate_error(lambda: DecisionGraphModel(CARDS, 2), DecisionGraphModel(CARDS, 2), world(20, 0))

@@ -47,16 +47,16 @@ def test_a_function_of_the_transition_is_learned_and_found_right_in_held_out_epi
     np.testing.assert_allclose(model(tests.states, tests.actions, tests.next_states), tests.rewards, atol=0.01)
 
 
-def test_rewards_that_hang_on_something_else_are_reported() -> None:
+def test_rewards_that_depend_on_something_unobserved_are_reported() -> None:
     data = rows(4000)
     hidden = np.random.default_rng(5).random(4000) < 0.3
     kept = np.array([1, 0, 0, 0], dtype=np.int64)
-    states: NDArray[np.int64] = data.states * kept  # few distinct transitions, so that the same ones come back
+    states: NDArray[np.int64] = data.states * kept  # few distinct transitions, so that they recur
     after: NDArray[np.int64] = data.next_states * kept
     report = LearnedReward((2,) * 4, 3).fit(replace(data, before=states, after=after, rewards=data.rewards + hidden))
     assert report.contrary == pytest.approx(0.3, abs=0.03)
     assert report.advice is not None
-    assert "hangs on what is not observed" in report.advice
+    assert "depends on something unobserved" in report.advice
 
 
 def test_both_zeros_are_one_reward() -> None:
@@ -85,7 +85,7 @@ def test_one_cause_is_found_among_very_many_bits_from_few_steps() -> None:
 
 
 def pictures(n: int, seed: int = 0) -> TransitionBatch:
-    """A coin (channel 0) and a player (channel 1) on a 5 by 5 board; meeting pays 1, but under action 1 costs 2."""
+    """A coin (channel 0) and a player (channel 1) on a 5 by 5 board; the reward in the same cell is 1, or -2 under action 1."""
     rng = np.random.default_rng(seed)
     boards = np.zeros((2, n, 2, 25), dtype=np.int64)
     for board in boards:
@@ -93,11 +93,13 @@ def pictures(n: int, seed: int = 0) -> TransitionBatch:
             board[np.arange(n), channel, rng.integers(25, size=n)] = 1
     before, after = boards.reshape(2, n, 50)
     actions = rng.integers(2, size=n)
-    met = (after.reshape(n, 2, 25).sum(axis=1) == 2).any(axis=1)
-    return TransitionBatch(before, actions, after, np.zeros(n, dtype=np.bool_), met * (1.0 - 3.0 * actions), np.arange(n) // 20)
+    together = (after.reshape(n, 2, 25).sum(axis=1) == 2).any(axis=1)
+    return TransitionBatch(
+        before, actions, after, np.zeros(n, dtype=np.bool_), together * (1.0 - 3.0 * actions), np.arange(n) // 20
+    )
 
 
-def test_on_planes_what_meets_what_is_found_wherever_it_is() -> None:
+def test_on_planes_rewards_for_a_shared_cell_are_found_everywhere() -> None:
     planes = FactoredSpace(spaces.MultiBinary((2, 5, 5))).planes
     model = LearnedReward((2,) * 50, 2, planes)
     assert model.fit(pictures(3000)).right == 1.0
@@ -123,18 +125,18 @@ def test_on_planes_what_meets_what_is_found_wherever_it_is() -> None:
             other.load_state_dict({**weights, name: array})
 
 
-def test_a_reward_that_was_met_once_is_kept_in_mind() -> None:
+def test_a_reward_that_was_observed_once_is_predicted() -> None:
     data = rows(600)
     once = np.arange(600) == 300
     model = LearnedReward((2,) * 4, 3)
-    # the fourth bit is on in that row alone
+    # the fourth bit is on in that row only
     states, after = data.states.copy(), data.next_states.copy()
     states[:, 3], after[:, 3] = 0, once
     model.fit(replace(data, before=states, after=after, rewards=once * 1.0))
     np.testing.assert_array_equal(model(states, data.actions, after), once)
 
 
-def test_sums_of_many_things_are_left_to_a_network() -> None:
+def test_sums_of_many_factors_are_predicted_by_a_network() -> None:
     rng, n = np.random.default_rng(0), 2000
     states, after = rng.integers(2, size=(2, n, 12))
     ends, actions = np.zeros(n, dtype=np.bool_), rng.integers(2, size=n)
@@ -144,7 +146,7 @@ def test_sums_of_many_things_are_left_to_a_network() -> None:
     assert not any(name.startswith("graphs.") for name in model.state_dict())
 
 
-def test_weights_come_back() -> None:
+def test_weights_are_restored() -> None:
     model = LearnedReward((2,) * 4, 3)
     data = rows(500)
     model.fit(data)

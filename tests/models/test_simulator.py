@@ -10,7 +10,7 @@ from tests.models.helpers import played
 GAMES = [GeyserRunner(), GeyserRunner(mode="deterministic"), FlierCatcher(height=4, width=5), Maneuverer(size=4)]
 
 
-def met(game: Game, n: int = 60) -> tuple[np.ndarray, np.ndarray]:
+def played_pairs(game: Game, n: int = 60) -> tuple[np.ndarray, np.ndarray]:
     rows = played(game, 5 * n, 15).rows()
     return rows.states[-n:], rows.actions[-n:]
 
@@ -19,7 +19,7 @@ def met(game: Game, n: int = 60) -> tuple[np.ndarray, np.ndarray]:
 def test_it_steps_as_the_game_does(game: Game) -> None:
     model = SimulatorModel(game)
     assert isinstance(model, TransitionModel)
-    states, actions = met(game)
+    states, actions = played_pairs(game)
     keys = derive(np.arange(len(states)), 5)
     following, ends = model.sample(states, actions, keys)
     observations = model.space.decode(states)
@@ -31,7 +31,7 @@ def test_it_steps_as_the_game_does(game: Game) -> None:
 @pytest.mark.parametrize("game", GAMES, ids=str)
 def test_successors_are_what_sampling_gives(game: Game) -> None:
     model = SimulatorModel(game)
-    states, actions = met(game)
+    states, actions = played_pairs(game)
     found = model.successors(states, actions, 16, seed=0)
     assert np.bincount(found.rows, weights=found.probabilities) == pytest.approx(np.ones(len(states)))
     for row in range(10):
@@ -48,7 +48,7 @@ def test_successors_are_what_sampling_gives(game: Game) -> None:
 def test_marginals_and_log_probabilities_are_exact() -> None:
     game = GeyserRunner(width=10)
     model = SimulatorModel(game)
-    states, actions = met(game)
+    states, actions = played_pairs(game)
     assert model.marginals(states, actions).reshape(len(states), -1, 2)[:, 10:, 1] == pytest.approx(
         np.full((len(states), 5), 0.2)
     )
@@ -76,7 +76,7 @@ def test_moments_of_the_true_geyser_runner_are_exact_within_sampling_error() -> 
     p = model.marginals(states, actions)[:, 1::2]  # exact probability that each bit is 1
     assert abs(mean - p).max() < 6 * np.sqrt(0.25 / n_samples)
     assert abs(variance - p * (1 - p)).max() < 6 * np.sqrt(0.25 / n_samples)
-    # Of a function: the place of the next eruption, uniform over five columns.
+    # Moments of a function: the position of the next eruption, uniform over five columns.
     mean, variance = model.moments(states, actions, of=lambda s: s[:, 10:].argmax(axis=1).astype(np.float64), n_samples=n_samples)
     assert mean.shape == (150,)
     assert abs(mean - 2.0).max() < 6 * np.sqrt(2.0 / n_samples)

@@ -21,7 +21,7 @@ def one_row(action: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return np.zeros((1, 2), dtype=np.int64), np.array([action])
 
 
-def test_probabilities_are_the_frequencies_met() -> None:
+def test_probabilities_are_the_observed_frequencies() -> None:
     model = TabularModel(CARDINALITIES, 2)
     model.fit(counted())
     following, ends = outcomes(CARDINALITIES)
@@ -41,7 +41,7 @@ def test_probabilities_are_the_frequencies_met() -> None:
     assert model.visits(*one_row()).tolist() == [6]
 
 
-def test_after_what_was_never_met_nothing_changes() -> None:
+def test_after_unobserved_pairs_nothing_changes() -> None:
     model = TabularModel(CARDINALITIES, 2)
     model.fit(counted())
     states, actions = np.array([[2, 1], [0, 0], [0, 0]]), np.array([0, 1, 0])

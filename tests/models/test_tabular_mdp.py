@@ -1,4 +1,4 @@
-"""Worlds known as tables: what they draw, list and refuse, and planning on one at once."""
+"""Known tables: samples, successors and errors, and planning without learning."""
 
 import gymnasium as gym
 import numpy as np

@@ -11,7 +11,7 @@ from mbagent_envs.random_keys import uniforms
 
 
 class Bulbs(ExactModel):
-    """Bits that go out on their own; action i > 0 lights bit i - 1."""
+    """Bits that switch off at random; action i > 0 switches bit i - 1 on."""
 
     def __init__(self, n: int, lasts: float | tuple[float, ...] = 0.8, n_actions: int | None = None) -> None:
         super().__init__((2,) * n, n + 1 if n_actions is None else n_actions)
@@ -46,25 +46,25 @@ def task(model: ExactModel, goal: object = count_bits, seed: int = 0) -> Task:
 
 
 def test_values_that_are_sums_over_factors_are_found() -> None:
-    """A bit that is on is worth what it earns until it goes out: lasts / (1 - gamma lasts)."""
+    """The value of an active bit is its expected income until it switches off: lasts / (1 - gamma lasts)."""
     model = Bulbs(8, n_actions=1)
     problem = Task(model, count_bits, np.ones((1, 8), dtype=np.int64), gamma=0.9, seed=0)
     leaf, _ = learn_values(problem)
-    on = np.eye(9, 8, -1, dtype=np.int64)  # none, then each alone
+    on = np.eye(9, 8, -1, dtype=np.int64)  # no bit, then each bit alone
     values = np.empty(9)
     evaluate(leaf, on, np.zeros(9, dtype=np.bool_), values)
     np.testing.assert_allclose(values[1:] - values[0], 0.8 / (1 - 0.9 * 0.8), rtol=0.2)
 
 
-def test_behaviour_by_learned_values_looks_beyond_one_step() -> None:
-    """Every lit bit earns the same at once; one that lasts is worth more."""
+def test_greedy_actions_on_learned_values_look_beyond_one_step() -> None:
+    """All active bits have the same immediate reward, but one that stays on longer has a higher value."""
     problem = task(Bulbs(2, lasts=(0.1, 0.95)))
     leaf, _ = learn_values(problem)
     assert greedy_actions(problem, leaf, np.array([[0, 0]]), 0)[0] == 2
 
 
 class Catch(ExactModel):
-    """A ball falls down its column, row by row; the actions move a paddle to the left or right, or leave it."""
+    """A ball falls down a column, one row at a time; actions move a paddle to the left or right, or not at all."""
 
     def __init__(self, width: int, height: int) -> None:
         super().__init__((width, height, width), 3)
@@ -88,8 +88,8 @@ def caught(states: States, actions: States, next_states: States) -> Floats:
     return there
 
 
-def test_what_matters_together_is_found() -> None:
-    """Where a paddle should be hangs on where the ball is: no sum over factors tells."""
+def test_values_that_depend_on_pairs_of_factors_are_found() -> None:
+    """The best place of the paddle depends on that of the ball, which no sum over single factors represents."""
     model, every = Catch(6, 8), np.array([(c, 0, p) for c in range(6) for p in range(6)])
     problem = Task(model, caught, every, gamma=0.9, seed=0)
     leaf, _ = learn_values(problem)
@@ -102,14 +102,14 @@ def test_what_matters_together_is_found() -> None:
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0])
-def test_nothing_is_learned_where_every_step_earns_the_same(value: float) -> None:
-    leaf, met = learn_values(task(Bulbs(3), lambda s, a, n: np.full(len(s), value)))
-    assert len(met) == 8
+def test_nothing_is_learned_if_all_rewards_are_equal(value: float) -> None:
+    leaf, visited = learn_values(task(Bulbs(3), lambda s, a, n: np.full(len(s), value)))
+    assert len(visited) == 8
     assert len(leaf.common) == 0
 
 
-def test_the_seed_decides() -> None:
-    # so many that their outcomes must be drawn
+def test_results_depend_on_the_seed_only() -> None:
+    # so many bits that their outcomes must be sampled
     first, again, other = (learn_values(task(Bulbs(8), seed=seed))[0] for seed in (1, 1, 2))
     np.testing.assert_array_equal(first.weights, again.weights)
     assert len(first.weights) != len(other.weights) or (first.weights != other.weights).any()

@@ -34,7 +34,7 @@ class StringWorld(TableWorld):
 
 
 @pytest.mark.parametrize("ends", [(), (3,)])
-def test_exact_forecasts_give_the_mean_return_of_going_step_by_step(ends: tuple[int, ...]) -> None:
+def test_exact_forecasts_have_the_mean_return_of_simulations_step_by_step(ends: tuple[int, ...]) -> None:
     table, rewards, n = random_table(6, 2, 0), np.arange(6.0), 20_000
     world, goal = TableWorld(table, ends), arrival_goal(rewards)
     model = DirectForecastModel(world, lambda k: StringWorld(table, ends, k), (2, 3, 4))
@@ -47,7 +47,7 @@ def test_exact_forecasts_give_the_mean_return_of_going_step_by_step(ends: tuple[
 
 
 class CoinWorld(TableWorld):
-    """Coins that are thrown again at every step; as a model of n steps, too. Coin i is drawn at number i of the key."""
+    """Coins that are tossed at every step, also as a model of n steps. Coin i uses random number i of the key."""
 
     def __init__(self, n_actions: int = 2) -> None:
         super().__init__(np.ones((2, n_actions, 2)))

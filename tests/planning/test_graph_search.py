@@ -26,7 +26,7 @@ def test_search_finds_the_best_action_of_a_stochastic_world(seed: int, ends: tup
 
 @pytest.mark.parametrize("seed", range(3))
 def test_search_repairs_a_lookahead_too_short_to_see_the_prize(seed: int) -> None:
-    # A corridor whose states pay the less the further they are from the prize, which lies 9 steps to the right.
+    # A corridor in which rewards decrease with the distance from the prize, 9 steps to the right.
     table, rewards = prize_corridor()
     short = PlannerSettings(lookahead_states=4, num_simulations=600, seed=seed)
     greedy = planner_alone(ValueIterationPlanner(short), table, rewards).plan(np.array([[0]]))
@@ -58,7 +58,7 @@ def test_every_simulation_goes_through_an_action_of_the_root(n: int, wave: int) 
         assert (plan.visits.max(axis=1) > 0.5 * n).all()
 
 
-def test_what_was_imagined_is_counted() -> None:
+def test_expanded_successors_are_counted() -> None:
     table, rewards = random_table(25, 3, 1), np.zeros(25)
     planner = GraphSearch(PlannerSettings(num_simulations=8, lookahead_states=1))
     planner_alone(planner, table, rewards).plan(np.array([[0]]))
@@ -69,7 +69,7 @@ def test_what_was_imagined_is_counted() -> None:
 
 
 def test_golden_graph() -> None:
-    # A frozen search: any change to selection, luck, growth or backup shows here and must be meant.
+    # A golden result: any change of selection, random numbers, expansion or backup changes it and must be intended.
     table, rewards = random_table(12, 2, 0), np.arange(12.0)
     settings = PlannerSettings(num_simulations=64, horizon=5, lookahead_states=2, c_uct=2.0, seed=1)
     plan = planner_alone(GraphSearch(settings), table, rewards).plan(np.array([[0], [1]]))

@@ -1,4 +1,4 @@
-"""Search on a known machine: right in the end, the same alone and in a batch, and for a seed the same again."""
+"""Search on a known MDP: correct in the limit, independent of the batch, and reproducible by its seed."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_values_become_the_optimal_ones(seed: int) -> None:
 
 
 def test_one_simulation_counts_and_leaf_values_are_used() -> None:
-    # From state 0 two sure steps lead to 1 or 2, of which only the first value tells that 2 is better.
+    # From state 0, deterministic actions lead to 1 or 2; only the initial values show that 2 is better.
     table = np.zeros((3, 2, 3))
     table[0, 0, 1] = table[0, 1, 2] = 1.0
     table[1, :, 1] = table[2, :, 2] = 1.0
@@ -61,8 +61,8 @@ def test_a_root_does_not_depend_on_the_others() -> None:
     assert not np.array_equal(search_machine(machine, roots, 200, 10).visits, together.visits)
 
 
-def test_where_nothing_is_known_all_actions_are_tried() -> None:
-    # A corridor of 6 cells, a prize at its end, first values that say nothing.
+def test_without_initial_values_all_actions_are_tried() -> None:
+    # A corridor of 6 cells with a prize at its end; all initial values are 0.
     table, rewards = np.zeros((6, 2, 6)), (np.arange(6) == 5).astype(np.float64)
     for s in range(6):
         table[s, 0, max(s - 1, 0)] = table[s, 1, min(s + 1, 5)] = 1.0

@@ -21,7 +21,7 @@ def test_search_finds_the_best_action_of_a_stochastic_world(seed: int, settings:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_search_repairs_a_lookahead_too_short_to_see_the_prize(seed: int) -> None:
-    # A corridor: the prize lies 9 steps to the right, the lookahead machine holds 4 states; the search must grow it.
+    # A corridor: the prize is 9 steps to the right, the lookahead has 4 states; the search must expand it.
     table, rewards = prize_corridor()
     short = PlannerSettings(max_states=1, lookahead_states=4, num_simulations=600, wave=4, learn_values=False, seed=seed)
     greedy = planner_for(ValueIterationPlanner(short), table, rewards).plan(np.array([[0]]))
@@ -32,8 +32,8 @@ def test_search_repairs_a_lookahead_too_short_to_see_the_prize(seed: int) -> Non
 
 
 def test_several_successors_are_kept_for_an_action() -> None:
-    # Action 0 is a coin toss between +1 and -0.6 (worth 0.2), action 1 pays nothing: one remembered child would
-    # mislead.
+    # Action 0 is a coin toss between +1 and -0.6 (mean 0.2), action 1 has reward 0: a single stored successor would
+    # give a wrong value.
     table = np.zeros((4, 2, 4))
     table[0, 0, 1] = table[0, 0, 2] = 0.5
     table[0, 1, 3] = 1.0
@@ -60,7 +60,7 @@ def test_a_plan_does_not_depend_on_the_batch(settings: PlannerSettings) -> None:
 
 
 def test_golden_tree() -> None:
-    # A frozen search: any change to selection, luck or backup shows here and must be meant.
+    # A golden result: any change of selection, random numbers or backup changes it and must be intended.
     table, rewards = random_table(6, 2, 0), np.arange(6.0)
     settings = PlannerSettings(leaf_values="rollouts", backup="mean", num_simulations=64, horizon=5, seed=1, c_uct=1.0)
     plan = planner_for(MctsPlanner(settings), table, rewards).plan(np.array([[0], [1]]))

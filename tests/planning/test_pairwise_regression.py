@@ -16,14 +16,14 @@ def drawn(n: int, seed: int) -> np.ndarray:
 
 
 def columns(states: np.ndarray, like: np.ndarray, paired: bool) -> np.ndarray:
-    """What the states have on, of that which the states of ``like`` have on, and all pairs of it."""
-    shown = []
+    """Those features of the states that are active in states of ``like``, and all their pairs."""
+    active = []
     for factor, values in enumerate(like.T):
         common = np.bincount(values).argmax()
-        shown += [states[:, factor] == value for value in np.unique(values) if value != common]
+        active += [states[:, factor] == value for value in np.unique(values) if value != common]
     if paired:
-        shown += [np.sqrt(PAIRED) * (a & b) for a, b in combinations(shown, 2)]
-    return np.stack(shown, axis=1).astype(np.float64)
+        active += [np.sqrt(PAIRED) * (a & b) for a, b in combinations(active, 2)]
+    return np.stack(active, axis=1).astype(np.float64)
 
 
 @pytest.mark.parametrize("paired", [True, False])

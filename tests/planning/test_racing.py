@@ -11,15 +11,15 @@ from mbagent.planning.value_function import LOWEST_KNOWN
 from mbagent.types import Actions, Bools, Floats, Randomness, States
 from tests.planning.test_fitted_value_iteration import Bulbs, count_bits
 
-WAYS = tuple(LookaheadConfig(LOWEST_KNOWN, n, 1) for n in range(1, 5))
+CONFIGS = tuple(LookaheadConfig(LOWEST_KNOWN, n, 1) for n in range(1, 5))
 N_BULBS = 14
 START = np.zeros((1, N_BULBS), dtype=np.int64)
 
 
 def best(*actions: int) -> int:
-    """Which of several ways plays best, each taking always one action."""
+    """Index of the winner among configurations, each of which always takes one action."""
     task = Task(Bulbs(3, lasts=0.5), count_bits, np.zeros((1, 3), dtype=np.int64), gamma=0.99, seed=0)
-    configs = WAYS[: len(actions)]
+    configs = CONFIGS[: len(actions)]
 
     def act(config: LookaheadConfig, states: States) -> Actions:
         return np.full(len(states), actions[configs.index(config)])
@@ -27,31 +27,31 @@ def best(*actions: int) -> int:
     return configs.index(best_config(task, configs, act))
 
 
-def test_a_better_way_is_found() -> None:
+def test_a_better_configuration_is_found() -> None:
     assert best(0, 1) == 1
     assert best(0, 0, 1) == 2
 
 
-def test_in_doubt_the_earlier_way_is_taken() -> None:
+def test_without_a_clear_difference_the_earlier_configuration_wins() -> None:
     assert best(1, 0) == 0
     assert best(1, 1) == 0
-    assert best(1, 2) == 0  # as good, and not alike
+    assert best(1, 2) == 0  # equally good, but not identical
     assert best(0, 1, 2, 0) == 1
 
 
-def test_no_way_is_played_twice_over() -> None:
-    """The best so far meets each of the others with the episodes that it has played already."""
+def test_no_configuration_is_simulated_twice() -> None:
+    """The best configuration so far is compared with each other one by the episodes that are already simulated."""
     calls: list[tuple[int, int]] = []
 
     def act(config: LookaheadConfig, states: States) -> Actions:
         calls.append((config.states, len(states)))
         return np.full(len(states), config.states % 3)
 
-    best_config(Task(Bulbs(3, lasts=0.5), count_bits, np.zeros((1, 3), dtype=np.int64), 0.99, 0), WAYS[:3], act)
+    best_config(Task(Bulbs(3, lasts=0.5), count_bits, np.zeros((1, 3), dtype=np.int64), 0.99, 0), CONFIGS[:3], act)
     assert max(Counter(calls).values()) <= MOST_BLOCKS * BLOCK_STEPS
 
 
-def test_episodes_that_end_earn_nothing_more() -> None:
+def test_no_rewards_follow_the_end_of_an_episode() -> None:
     class Ending(Bulbs):
         def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
             after, _ = super().sample(states, actions, rng)
@@ -59,8 +59,8 @@ def test_episodes_that_end_earn_nothing_more() -> None:
 
     task = Task(Ending(1), count_bits, np.zeros((1, 1), dtype=np.int64), gamma=0.5, seed=0)
     lit, dark = (
-        _Trial(task, WAYS[0], lambda config, s: np.ones(len(s), int)),
-        _Trial(task, WAYS[0], lambda config, s: np.zeros(len(s), int)),
+        _Trial(task, CONFIGS[0], lambda config, s: np.ones(len(s), int)),
+        _Trial(task, CONFIGS[0], lambda config, s: np.zeros(len(s), int)),
     )
     assert set(lit.returns(3)) == {1.0}
     assert set(dark.returns(3)) == {0.0}
@@ -78,8 +78,8 @@ def planner(kind: type[ValueIterationPlanner] = MctsPlanner, **changes: object) 
 
 
 @pytest.mark.parametrize("kind", [ValueIterationPlanner, MctsPlanner])
-def test_learned_values_are_used_where_they_play_better(kind: type[ValueIterationPlanner]) -> None:
-    """Of many bits that go out, whichever is off should be lit; looking ahead thinly tells luck from merit badly."""
+def test_learned_values_are_used_if_they_perform_better(kind: type[ValueIterationPlanner]) -> None:
+    """Of many bits that switch off, one that is off should be switched on; a lookahead with few samples is too noisy for that."""
     states = np.eye(N_BULBS, dtype=np.int64)[:5] ^ 1
     found = planner(kind)
     np.testing.assert_array_equal(found.plan(states).actions, np.arange(1, 6))
@@ -87,7 +87,7 @@ def test_learned_values_are_used_where_they_play_better(kind: type[ValueIteratio
     assert len(found._config.leaf.weights)
 
 
-def test_plans_do_not_hang_on_what_else_is_planned() -> None:
+def test_plans_do_not_depend_on_the_batch() -> None:
     states = np.random.default_rng(0).integers(0, 2, size=(6, N_BULBS))
     together = planner().plan(states)
     alone = planner()
@@ -96,7 +96,7 @@ def test_plans_do_not_hang_on_what_else_is_planned() -> None:
         np.testing.assert_array_equal(plan.values[0], together.values[i])
 
 
-def test_rehearsal_knows_neither_clock_nor_memory() -> None:
+def test_racing_uses_neither_time_budget_nor_reuse() -> None:
     timed = planner(time_budget=0.01, reuse_tree=True)
     timed.plan(START)
     assert timed.settings.time_budget == 0.01
@@ -105,7 +105,7 @@ def test_rehearsal_knows_neither_clock_nor_memory() -> None:
     assert planner()._chosen_config().states == timed._config.states
 
 
-def test_values_go_with_their_goal() -> None:
+def test_values_are_dropped_with_their_goal() -> None:
     made = planner()
     made.plan(START)
     first = made._config

@@ -1,4 +1,4 @@
-"""Plans count outcomes that are rare and decide, say where they cannot count them all, and explain them."""
+"""Rare but decisive outcomes take part in plans and explanations; there is a warning if they cannot all be represented."""
 
 import warnings
 from typing import Any
@@ -18,7 +18,7 @@ GAMMA = 0.95
 
 
 class Dam(gym.Env[Any, Any]):
-    """A reservoir run full earns 3 a step and may burst; run low it earns 2. Lamps, if any, flicker at random."""
+    """A reservoir: at full level the reward is 3 per step and it may burst, at low level 2. Lamps, if any, flicker at random."""
 
     def __init__(self, p: float, loss: float, lamps: int = 0) -> None:
         self.p, self.loss, self.lamps = p, loss, lamps
@@ -40,7 +40,7 @@ class Dam(gym.Env[Any, Any]):
 
 
 def values_of(p: float, loss: float) -> tuple[float, float]:
-    """Exact values of running low and full, whatever the state."""
+    """Exact values of operation at low and full level, which are the same in all states."""
     low, full = 2.0 / (1.0 - GAMMA), (3.0 * (1.0 - p) - loss * p) / (1.0 - GAMMA * (1.0 - p))
     best = max(low, full)
     return 2.0 + GAMMA * best, (1.0 - p) * (3.0 + GAMMA * best) - p * loss
@@ -49,13 +49,13 @@ def values_of(p: float, loss: float) -> tuple[float, float]:
 def learned(env: Any, policy: str, steps: int, **kwargs: Any) -> ModelLearningAgent:
     agent = ModelLearningAgent(policy, env, seed=0, gamma=GAMMA, **kwargs)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that the reward is learned
+        warnings.simplefilter("ignore")  # the warning that the reward is learned
         return agent.learn(steps, log_interval=None)
 
 
 @pytest.mark.parametrize("policy", ["MctsPolicy", "ValueIterationPolicy"])
 @pytest.mark.parametrize(("p", "loss"), [(0.004, 900.0), (0.002, 3000.0), (0.003, 50.0)])
-def test_a_loss_far_below_one_percent_decides_where_it_should(policy: str, p: float, loss: float) -> None:
+def test_a_loss_of_far_less_than_one_percent_decides_if_it_should(policy: str, p: float, loss: float) -> None:
     agent = learned(Dam(p, loss), policy, 12_000)
     rows = agent.transitions.rows()
     seen = float(rows.terminated[rows.actions == 1].mean())
@@ -74,7 +74,7 @@ def test_a_loss_far_below_one_percent_decides_where_it_should(policy: str, p: fl
 
 
 class LeakyTank(Dam):
-    """The same on two planes: a mark that goes round in the first; a burst is a cell of the second, and the end."""
+    """The same on two planes: a mark cycles in the first; a burst is a cell of the second and terminates the episode."""
 
     def __init__(self, p: float, loss: float) -> None:
         super().__init__(p, loss)
@@ -91,7 +91,7 @@ class LeakyTank(Dam):
 
 
 @pytest.mark.parametrize("loss", [900.0, 30.0])
-def test_on_planes_a_rare_end_comes_with_the_cell_that_shows_it(loss: float) -> None:
+def test_on_planes_a_rare_termination_has_the_cell_that_shows_it(loss: float) -> None:
     env = LeakyTank(0.004, loss)
     agent = learned(env, "MctsPolicy", 12_000)
     rows = agent.transitions.rows()
@@ -113,7 +113,7 @@ def test_a_rare_loss_among_flickering_lamps_is_seen_by_search() -> None:
     assert agent.predict(observations)[0].tolist() == [0] * 20
 
 
-def test_a_jackpot_of_less_than_one_percent_is_worth_its_mean() -> None:
+def test_the_value_of_a_jackpot_of_less_than_one_percent_is_its_mean() -> None:
     class Bandit(gym.Env[Any, Any]):
         observation_space, action_space = spaces.Discrete(2), spaces.Discrete(3)
 
@@ -136,7 +136,7 @@ def test_a_jackpot_of_less_than_one_percent_is_worth_its_mean() -> None:
 
 
 def blinking(n_bits: int) -> DecisionGraphModel:
-    """Each of some bits is on after a step with 1%, whatever was; the last goes on with action 1."""
+    """Each bit is on after a step with probability 1%, independently of the state; the last one is switched on by action 1."""
     rng, n = np.random.default_rng(2), 4000
     action = rng.integers(2, size=n)
     after = (rng.random((n, n_bits)) < 0.01).astype(np.int64)
@@ -148,7 +148,7 @@ def blinking(n_bits: int) -> DecisionGraphModel:
 
 
 @pytest.mark.parametrize("n_bits", [3, 25])
-def test_plans_say_where_rare_outcomes_that_may_decide_have_no_room(n_bits: int) -> None:
+def test_plans_warn_if_merged_rare_outcomes_may_be_decisive(n_bits: int) -> None:
     settings = PlannerSettings(n_samples=4, max_states=1, num_simulations=16, learn_values=False)
     planner, start = MctsPlanner(settings), np.zeros((1, n_bits), dtype=np.int64)
     planner.set_model(blinking(n_bits), start)
@@ -156,5 +156,5 @@ def test_plans_say_where_rare_outcomes_that_may_decide_have_no_room(n_bits: int)
     if n_bits > 10:
         with pytest.warns(UserWarning, match="could change the choice of an action: raise n_samples"):
             planner.plan(start)
-    for _ in range(2):  # said once for a goal, or never
+    for _ in range(2):  # at most one warning for each goal
         assert planner.plan(start).actions.tolist() == [1]

@@ -25,14 +25,14 @@ def planner(settings: PlannerSettings) -> MctsPlanner:
     return made
 
 
-def carries_on(made: MctsPlanner, state: int) -> bool:
-    """Whether a plan from the state begins with more visits than its own simulations."""
+def is_reused(made: MctsPlanner, state: int) -> bool:
+    """Whether a plan from the state starts from the search of the last decision."""
     made.plan(np.array([[state]]))
     return made._last is not None and made._last.decision > 0
 
 
 @pytest.mark.parametrize("kind", list(KINDS))
-def test_what_is_carried_over_is_what_was_known(kind: str) -> None:
+def test_reused_statistics_are_those_of_the_last_search(kind: str) -> None:
     made = planner(KINDS[kind])
     made.plan(np.array([[0]]))
     last = made._last
@@ -56,15 +56,15 @@ def test_what_is_carried_over_is_what_was_known(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", list(KINDS))
-def test_a_walk_with_a_kept_tree_acts_well(kind: str) -> None:
+def test_decisions_with_reused_trees_have_a_small_regret(kind: str) -> None:
     made, exact, state = planner(KINDS[kind]), optimal_q(TABLE, REWARDS, 0.8), 0
-    rng, carried, regrets = np.random.default_rng(0), 0, []
+    rng, reused, regrets = np.random.default_rng(0), 0, []
     for _ in range(25):
         action = int(made.plan(np.array([[state]])).actions[0])
-        carried += made._last is not None and made._last.decision > 0
+        reused += made._last is not None and made._last.decision > 0
         regrets.append(exact[state].max() - exact[state, action])
         state = int(rng.choice(12, p=TABLE[state, action]))
-    assert carried >= 10
+    assert reused >= 10
     assert np.mean(regrets) < 0.03 * np.ptp(exact)
 
 
@@ -72,15 +72,15 @@ def test_a_walk_with_a_kept_tree_acts_well(kind: str) -> None:
 def test_new_goals_models_episodes_and_batches_drop_the_tree(kind: str) -> None:
     made = planner(KINDS[kind])
     first = made.plan(np.array([[0]]))
-    assert carries_on(made, 0)
+    assert is_reused(made, 0)
     made.forget()
-    assert not carries_on(made, 0)
+    assert not is_reused(made, 0)
     made.set_goal(arrival_goal(REWARDS))
-    assert not carries_on(made, 0)
+    assert not is_reused(made, 0)
     made.set_model(WORLD, np.array([[0]]))
-    assert not carries_on(made, 0)
+    assert not is_reused(made, 0)
     batch = made.plan(np.array([[0], [1]]))
-    assert not carries_on(made, 0)
+    assert not is_reused(made, 0)
     made.forget()
     np.testing.assert_array_equal(made.plan(np.array([[0]])).values, first.values)
     np.testing.assert_array_equal(batch.values[0], first.values[0])
@@ -90,10 +90,10 @@ def test_a_tree_grown_too_large_is_dropped(monkeypatch: pytest.MonkeyPatch) -> N
     made = planner(KINDS["machine"])
     made.plan(np.array([[0]]))
     monkeypatch.setattr(planners, "MAX_KEPT", 5)
-    assert not carries_on(made, 0)
+    assert not is_reused(made, 0)
 
 
-def test_a_goal_that_fails_leaves_no_half_done_tree() -> None:
+def test_a_goal_that_fails_leaves_no_incomplete_tree() -> None:
     made = planner(KINDS["machine"])
     made.set_model(TableWorld(random_table(3000, 2, 5)), np.array([[0]]))
     made.set_goal(lambda states, actions, following: np.zeros(len(actions)))

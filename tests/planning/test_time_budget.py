@@ -1,4 +1,4 @@
-"""Decisions by the clock; a clock of the test's own makes them exact."""
+"""Decisions with a time budget; a simulated clock makes them reproducible."""
 
 import time
 
@@ -13,7 +13,7 @@ from tests.worlds import TableWorld, arrival_goal, random_table
 
 
 class Clock:
-    """Goes on by a second with every look at it."""
+    """Advances by one second at every call."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -35,7 +35,7 @@ def simulations(made: Planner, n_roots: int, monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("planner_class", [MctsPlanner, FlatMonteCarlo])
-def test_more_time_gives_more_simulations_and_every_decision_has_a_wave(
+def test_more_time_gives_more_simulations_and_every_decision_has_a_batch(
     planner_class: type[Planner], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def of(budget: float, n_roots: int = 1) -> float:
@@ -47,18 +47,18 @@ def test_more_time_gives_more_simulations_and_every_decision_has_a_wave(
     assert of(10.0, n_roots=4) == of(40.0)  # the budget is for each decision
 
 
-def test_rollouts_go_by_the_clock_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rollouts_respect_the_time_budget_too(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = PlannerSettings(leaf_values="rollouts", backup="mean", wave=4, time_budget=20.0)
     assert simulations(MctsPlanner(settings), 1, monkeypatch) > 8
 
 
-def test_a_search_ends_where_it_holds_too_much(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_ends_at_its_maximum_size(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planners, "MAX_SEARCHED", 1)
     settings = PlannerSettings(max_states=1, lookahead_states=3, wave=4, time_budget=1e6)
     assert simulations(MctsPlanner(settings), 1, monkeypatch) == 4
 
 
-def test_a_solved_machine_needs_no_time() -> None:
+def test_a_solved_mdp_needs_no_time() -> None:
     plan = planner(MctsPlanner(PlannerSettings(time_budget=1e6))).plan(np.array([[0]]))
     assert plan.visits.sum() == 0.0
 

@@ -10,7 +10,7 @@ from tests.worlds import TableWorld, arrival_goal, random_table
 
 SETTINGS = {
     "solved": PlannerSettings(gamma=0.8),
-    "imagined": PlannerSettings(max_states=1, lookahead_states=6, num_simulations=8),
+    "search": PlannerSettings(max_states=1, lookahead_states=6, num_simulations=8),
     "rollouts": PlannerSettings(leaf_values="rollouts", backup="mean", num_simulations=40, horizon=6),
 }
 
@@ -22,7 +22,7 @@ def trace(planner: ValueIterationPlanner, ends: tuple[int, ...] = ()) -> PlanTra
 
 
 def every_future(found: PlanTrace, action: int, n_steps: int) -> list[tuple[float, list[int]]]:
-    """All sequences of edges by plain enumeration, the likeliest first."""
+    """All sequences of edges by enumeration, the most probable first."""
     graph, whole = found.graph, []
     paths: list[tuple[float, list[int], int, int]] = [(1.0, [], found.root, action)]
     while paths:
@@ -40,7 +40,7 @@ def every_future(found: PlanTrace, action: int, n_steps: int) -> list[tuple[floa
 
 @pytest.mark.parametrize("ends", [(), (2, 5)])
 @pytest.mark.parametrize("kind", list(SETTINGS))
-def test_the_likeliest_futures_are_those_of_plain_enumeration(kind: str, ends: tuple[int, ...]) -> None:
+def test_the_likeliest_trajectories_are_those_of_enumeration(kind: str, ends: tuple[int, ...]) -> None:
     found = trace(MctsPlanner(SETTINGS[kind]), ends)
     for n_steps, action in product((1, 2, 5), range(2)):
         expected = every_future(found, action, n_steps)
@@ -51,8 +51,8 @@ def test_the_likeliest_futures_are_those_of_plain_enumeration(kind: str, ends: t
         assert all(path in [other for _, other in expected] for path in futures)
 
 
-def test_many_equally_likely_steps_do_not_make_the_search_for_futures_endless() -> None:
-    n = 40  # 40 ** 12 futures, all alike
+def test_many_equally_likely_steps_do_not_make_the_search_for_trajectories_endless() -> None:
+    n = 40  # 40 ** 12 trajectories of equal probability
     planner = ValueIterationPlanner(PlannerSettings())
     planner.set_model(TableWorld(np.full((n, 2, n), 1.0 / n)), np.array([[0]]))
     planner.set_goal(arrival_goal(np.arange(float(n))))
@@ -61,7 +61,7 @@ def test_many_equally_likely_steps_do_not_make_the_search_for_futures_endless() 
 
 
 @pytest.mark.parametrize("kind", list(SETTINGS))
-def test_foresight_shows_the_very_plan(kind: str) -> None:
+def test_the_trace_has_the_same_plan(kind: str) -> None:
     planner = MctsPlanner(SETTINGS[kind])
     assert isinstance(planner, TracingPlanner)
     found = trace(planner)

@@ -16,7 +16,7 @@ from worlds.coupled import IndependentModel
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_values_of_a_complete_machine_are_exact(seed: int) -> None:
+def test_values_of_a_complete_mdp_are_exact(seed: int) -> None:
     table, rewards = random_table(12, 3, seed), np.random.default_rng(seed).normal(size=12)
     world = TableWorld(table, ends=(11,))
     graph, complete = grow_reachable(world, np.array([[0]]), max_states=100, n_samples=4)
@@ -27,7 +27,7 @@ def test_values_of_a_complete_machine_are_exact(seed: int) -> None:
     np.testing.assert_allclose(values.q[inside], exact[graph.states[inside, 0]], atol=1e-5)
 
 
-def test_terminal_states_are_not_looked_beyond() -> None:
+def test_terminal_states_have_no_successors() -> None:
     table = np.zeros((3, 1, 3))
     table[0, 0, 1] = table[1, 0, 2] = table[2, 0, 2] = 1.0
     graph, complete = grow_reachable(TableWorld(table, ends=(1,)), np.array([[0]]), 10, 4)
@@ -37,22 +37,22 @@ def test_terminal_states_are_not_looked_beyond() -> None:
     assert values.q[0, 0] == pytest.approx(1.0)
 
 
-def test_an_endless_cost_does_not_end_at_the_edge_of_what_was_imagined() -> None:
+def test_an_endless_cost_does_not_end_at_unexpanded_states() -> None:
     n = 50
     table = np.zeros((n, 2, n))
     for s in range(n):
         table[s, 0, s] = 1.0  # stay
-        table[s, 1, min(s + 1, n - 1)] = 1.0  # towards the edge
+        table[s, 1, min(s + 1, n - 1)] = 1.0  # towards unexpanded states
     graph = StateGraph(TableWorld(table))
     graph.add(np.array([[0]]), np.zeros(1, dtype=np.int64))
     for _ in range(10):
         graph.expand(np.flatnonzero(~graph.expanded), 1, 0)
     values = solve(graph, arrival_goal(np.full(n, -1.0)), gamma=0.99)
-    # Every behaviour costs 1 a step for ever: nothing is gained by running to where nothing was imagined.
+    # Every policy costs 1 per step for ever: nothing is gained by moving to unexpanded states.
     np.testing.assert_allclose(values.v, -100.0, rtol=1e-3)
 
 
-def test_groups_are_solved_alike_alone_and_together() -> None:
+def test_solutions_of_groups_do_not_depend_on_the_batch() -> None:
     table, rewards = random_table(30, 2, 3), np.random.default_rng(3).normal(size=30) * 10
     world, goal = TableWorld(table), arrival_goal(rewards)
     settings = PlannerSettings(max_states=1, lookahead_states=12, horizon=6)
@@ -67,7 +67,7 @@ def test_groups_are_solved_alike_alone_and_together() -> None:
         assert alone.actions[0] == together.actions[i]
 
 
-def test_start_states_beyond_the_budget_give_no_machine_but_a_plan() -> None:
+def test_more_states_than_max_states_give_no_mdp_but_a_plan() -> None:
     world = TableWorld(random_table(40, 2, 1))
     planner = ValueIterationPlanner(PlannerSettings(max_states=5))
     planner.set_model(world, np.array([[0]]))
@@ -75,7 +75,7 @@ def test_start_states_beyond_the_budget_give_no_machine_but_a_plan() -> None:
     assert planner.plan(np.array([[0], [7]])).values.shape == (2, 2)
 
 
-def test_the_machine_of_the_true_geyser_runner_is_exact() -> None:
+def test_the_reachable_mdp_of_the_true_geyser_runner_is_exact() -> None:
     # 50 states: every transition probability, and the optimum the design states for a high cost.
     game = GeyserRunner(hit_cost=5.0)
     model = SimulatorModel(game)
@@ -93,11 +93,11 @@ def test_the_machine_of_the_true_geyser_runner_is_exact() -> None:
 
 
 class SampledGame(SimulatorModel):
-    """A true model that does not list its successors: the machine has to be built from draws."""
+    """A true model that does not list its successors: the MDP must be estimated from samples."""
 
     def __init__(self, game: GeyserRunner) -> None:
         super().__init__(game)
-        self._lists = False
+        self.lists = False
 
 
 def values_of(mdp: ReachableMDP, game: GeyserRunner, gamma: float) -> dict[bytes, float]:
@@ -116,7 +116,7 @@ def values_of(mdp: ReachableMDP, game: GeyserRunner, gamma: float) -> dict[bytes
 
 
 @pytest.mark.parametrize("hit_cost", [1.0, 5.0])
-def test_the_machine_drawn_from_the_geyser_runner_is_right_within_sampling_error(hit_cost: float) -> None:
+def test_the_mdp_sampled_from_the_geyser_runner_is_right_within_sampling_error(hit_cost: float) -> None:
     game, n_samples = GeyserRunner(hit_cost=hit_cost), 10_000
     listed, drawn = SimulatorModel(game), SampledGame(game)
     exact = listed.reachable_mdp(listed.start_states(64))
@@ -130,7 +130,7 @@ def test_the_machine_drawn_from_the_geyser_runner_is_right_within_sampling_error
     assert max(abs(found[state] - value) / abs(value) for state, value in truth.items()) < 0.01
 
 
-def test_a_machine_too_large_for_its_budget_is_partial_and_says_so() -> None:
+def test_an_mdp_of_more_than_max_states_is_marked_as_partial() -> None:
     model = SimulatorModel(GeyserRunner())
     mdp = model.reachable_mdp(model.start_states(64), max_states=20)
     assert not mdp.complete
@@ -141,15 +141,15 @@ def test_a_machine_too_large_for_its_budget_is_partial_and_says_so() -> None:
     np.testing.assert_allclose(totals, 1.0)
 
 
-@pytest.mark.parametrize(("budget", "told"), [({"max_states": 0}, "max_states is 0"), ({"n_samples": 0}, "n_samples is 0")])
-def test_a_machine_of_nothing_is_refused(budget: dict[str, int], told: str) -> None:
+@pytest.mark.parametrize(("budget", "message"), [({"max_states": 0}, "max_states is 0"), ({"n_samples": 0}, "n_samples is 0")])
+def test_an_empty_mdp_is_refused(budget: dict[str, int], message: str) -> None:
     model = SimulatorModel(GeyserRunner())
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         model.reachable_mdp(model.start_states(4), **budget)
 
 
 def many_corridors(n_corridors: int, length: int) -> tuple[TableWorld, np.ndarray]:
-    """Corridors with a prize at cell 0; from there a random cell of any corridor; in every other one the prize is missing."""
+    """Corridors with a prize at cell 0, from where a random cell of any corridor follows; every other corridor has no prize."""
     n = n_corridors * length
     table, rewards = np.zeros((n, 2, n)), np.zeros(n)
     for corridor, cell in np.ndindex(n_corridors, length):
@@ -165,8 +165,8 @@ def many_corridors(n_corridors: int, length: int) -> tuple[TableWorld, np.ndarra
 
 @pytest.mark.parametrize("start", [1, 2, 5, 8])
 def test_a_prize_that_opens_many_random_states_does_not_keep_the_agent_walking(start: int) -> None:
-    # The 600 states behind the prize are far more than the lookahead holds: spent on them, the corridor itself would
-    # stay half unknown, and its unknown end look better than the prize.
+    # The 600 states after the prize are far more than the lookahead can expand: if it expanded them first, the corridor
+    # itself would stay half unexpanded, and its unexpanded end would seem better than the prize.
     world, rewards = many_corridors(60, 10)
     planner = ValueIterationPlanner(PlannerSettings(max_states=1, lookahead_states=40))
     planner.set_model(world, np.array([[start]]))
@@ -175,7 +175,7 @@ def test_a_prize_that_opens_many_random_states_does_not_keep_the_agent_walking(s
         assert planner.plan(np.array([[cell]])).actions[0] == 0
 
 
-def test_the_lookahead_knows_what_is_sure_before_it_follows_luck() -> None:
+def test_the_lookahead_expands_certain_states_before_random_ones() -> None:
     world, _ = many_corridors(60, 10)
     graph = StateGraph(world)
     roots = graph.add(np.array([[1]]), np.zeros(1, dtype=np.int64))
@@ -184,7 +184,7 @@ def test_the_lookahead_knows_what_is_sure_before_it_follows_luck() -> None:
     assert graph.expanded.sum() == 30
 
 
-def test_where_nothing_matters_in_sight_the_agent_makes_for_what_it_has_not_imagined() -> None:
+def test_without_rewards_in_the_lookahead_the_agent_moves_to_unexpanded_states() -> None:
     # A corridor closed on the left; the lookahead of 6 states ends before the prize at cell 30.
     n = 40
     table = np.zeros((n, 2, n))
@@ -194,22 +194,22 @@ def test_where_nothing_matters_in_sight_the_agent_makes_for_what_it_has_not_imag
     planner.set_model(TableWorld(table), np.array([[0]]))
     planner.set_goal(arrival_goal((np.arange(n) == 30).astype(np.float64)))
     plan = planner.plan(np.array([[0], [1], [2]]))
-    assert np.ptp(plan.values) == 0.0  # ties are broken without touching the values
+    assert np.ptp(plan.values) == 0.0  # breaking ties does not change the values
     assert plan.actions.tolist() == [1, 1, 1]
     planner.set_goal(arrival_goal((np.arange(n) == 0).astype(np.float64)))
-    assert planner.plan(np.array([[2]])).actions[0] == 0  # a prize comes first
+    assert planner.plan(np.array([[2]])).actions[0] == 0  # rewards take precedence
 
 
-def test_a_small_machine_is_drawn_more_finely() -> None:
+def test_a_small_mdp_gets_more_samples() -> None:
     drawn = SampledGame(GeyserRunner())
     mdp = SolvedMdp(drawn, drawn.start_states(64), max_states=3000, n_samples=16, seed=0)
     assert mdp.graph is not None
     assert abs(mdp.graph.probabilities - 0.2).max() < 5 * np.sqrt(0.2 * 0.8 / MOST_SMALL_SAMPLES)
 
 
-def test_what_finer_draws_find_does_not_cost_the_machine() -> None:
+def test_states_that_only_more_samples_find_do_not_prevent_a_solved_mdp() -> None:
     table = np.zeros((40, 1, 40))
-    table[:, 0, 0], table[0, 0, 1:] = 1.0, 0.002  # ways out of one state, all of which only many draws meet
+    table[:, 0, 0], table[0, 0, 1:] = 1.0, 0.002  # exits of one state that only many samples find
     table[0, 0, 1] = 0.5
     table[0, 0, 0] = 1.0 - table[0, 0, 1:].sum()
     mdp = SolvedMdp(SampledWorld(table), np.array([[0]]), max_states=5, n_samples=4, seed=0)
@@ -219,23 +219,23 @@ def test_what_finer_draws_find_does_not_cost_the_machine() -> None:
 
 
 class SampledWorld(TableWorld):
-    """A table that is only drawn from."""
+    """A table with samples only, without listed successors."""
 
     successors = BaseTransitionModel.successors
 
 
 @pytest.mark.parametrize(("n_actions", "draws"), [(8, 256), (1024, 47), (4096, 2)])
-def test_with_thousands_of_actions_each_is_drawn_less_often(n_actions: int, draws: int) -> None:
-    """Else room for the outcomes of one state, each with a row of all actions, would take tens of gigabytes."""
-    asked = set()
+def test_with_thousands_of_actions_each_gets_fewer_samples(n_actions: int, draws: int) -> None:
+    """Otherwise the outcomes of one state, each with entries for all actions, would take tens of gigabytes."""
+    requested = set()
 
     class Coin(IndependentModel):
         def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
-            asked.add(n_samples)
+            requested.add(n_samples)
             return super().successors(states, actions, n_samples, seed)
 
     model = Coin((2,), n_actions, lambda states, actions: np.full((len(states), 1, 2), 0.5))
     graph, complete = grow_reachable(model, np.zeros((1, 1), dtype=np.int64), 10, 256)
-    assert asked == {draws}
+    assert requested == {draws}
     assert complete
     assert len(graph) == 2

@@ -1,9 +1,9 @@
-"""Decision graphs as few flat arrays, and which units a state touches: what planning with them need not look at.
+"""Decision graphs as few flat arrays, with an index of the variables that a state affects, so that search evaluates only these.
 
-In a state where everything is 0, each unit has a *usual* distribution for each action; mostly it stays as it is. In another
-state only those units can differ that usually ask for a column in which the states differ, or that differ themselves. With few
-things on a board these are few, whatever its size.
-Shapes: A actions, U units, F factors, R values of all factors, W words of 64 units, M meetings, Q couplings.
+In the all-zero state, each variable has a *usual* distribution for each action; mostly it keeps its value. In another state, a
+variable can only differ from this if a feature that is tested on its usual path differs, or if its own value does. If few cells
+of a board are occupied, these variables are few, regardless of the size of the board.
+Shapes: A actions, U variables, F factors, R values of all factors, W words of 64 variables, M adjacency features, Q mutex groups.
 """
 
 from __future__ import annotations
@@ -21,38 +21,38 @@ from mbagent.types import Bools, Floats, Ints, Words
 from mbagent_envs.jit import compiled, inlined
 
 MOST_WORDS = 4_000_000
-"""Words of a table for each action; where they would be more, one table serves all actions."""
+"""Maximum number of words of tables for each single action; beyond it, one table serves all actions."""
 
 FIRST, MEMBERS, OUTPUTS, START, PAIR, MUTEX = range(6)
 """Columns of ``AffectedIndex.variables``."""
 
 
 class AffectedIndex(NamedTuple):
-    """Graphs as few arrays, and what each value of each factor touches.
+    """Graphs as few arrays, and the variables that each value of each factor affects.
 
     Attributes:
         variables: where its factors begin, how many there are, number of values, where its distribution and its pairs begin, and
-            its coupling or -1, int64 [U, 6].
-        members: factors of the units, int64.
-        entries: where the entries of each pair begin, int64 [pairs + 1]; see ``compiled.Graphs``.
+            its mutex group or -1, int64 [U, 6].
+        members: factors of the variables, int64.
+        entries: where the entries of each pair begin, int64 [pairs + 1]; see ``arrays.Graphs``.
         entry: value and first node, int64 [E, 2].
-        node: column, and the next node where it is off and on, int32 [nodes, 3].
+        node: feature, and the next node where it is off and on, int32 [nodes, 3].
         leaf: rate and spread, [nodes, 2].
-        smoothing: of each pair, how often it stays and how probable novelties are, [pairs, 2].
-        base: where novelties are drawn from, [sum of cardinalities].
-        still: probability that a unit without graphs changes, [1].
-        noise: see ``compiled.Graphs``.
-        exactly: of the couplings, bool [Q].
+        smoothing: persistence and unseen mass of each pair, [pairs, 2].
+        base: distribution of unseen values, [sum of cardinalities].
+        still: probability that a variable without graphs changes, [1].
+        noise: see ``arrays.Graphs``.
+        exactly: whether exactly one bit of a mutex group is on, bool [Q].
         row: where each factor's values begin among the rows, int64 [F + 1].
-        shown: where each factor's columns begin, int64 [F + 1].
-        features: the lowest and highest value for which each is on, int64 [D, 2].
+        shown: where each factor's features begin, int64 [F + 1].
+        features: the lowest and highest value for which each state feature is on, int64 [D', 2].
         cells, adjacencies, counts, observed, weights: see ``features.Layout``.
-        touched: units that a factor's value touches, as bits, uint64 [A or 1, R, W].
-        by_adjacency: the same of meetings, uint64 [A or 1, M, W].
-        always: units that do something even where everything is 0, uint64 [A, W].
-        usual_on: columns that are on where everything is 0 and no action is taken, bool [D].
+        touched: variables that a factor's value affects, as bits, uint64 [A or 1, R, W].
+        by_adjacency: variables that each adjacency feature affects, uint64 [A or 1, M, W].
+        always: variables that may change even in the all-zero state, uint64 [A, W].
+        usual_on: features that are on in the all-zero state without an action, bool [D].
         encoding, factor, next_adjacencies: see ``features.Layout``.
-        end_first, end_node, end_rate: graph of the end where it is drawn late, else empty, see ``ending.end_graph``.
+        end_first, end_node, end_rate: graph of the end if it is synchronic, else empty, see ``end_graph``.
     """
 
     variables: Ints
@@ -87,12 +87,12 @@ class AffectedIndex(NamedTuple):
 
 
 def affected_index(layout: Layout, graphs: Graphs, synchronic: Graphs, cardinalities: tuple[int, ...]) -> AffectedIndex:
-    """The arrays of some graphs.
+    """The arrays and the index of some graphs.
 
     Args:
-        layout: the units.
-        graphs: of all of them, for planning.
-        synchronic: of none, or of the end alone.
+        layout: the variables.
+        graphs: of all variables, for planning.
+        synchronic: of no variable, or only of ``terminated``.
         cardinalities: number of values of each factor, length F.
     """
     row = np.concatenate([[0], np.cumsum(cardinalities)]).astype(np.int64)
@@ -137,34 +137,34 @@ def affected_index(layout: Layout, graphs: Graphs, synchronic: Graphs, cardinali
 
 
 def _tables(layout: Layout, graphs: Graphs, row: Ints) -> tuple[Words, Words, Words, Bools]:
-    """``always``, ``touched``, ``by_adjacency`` and ``usual_on`` of Lean."""
+    """``always``, ``touched``, ``by_adjacency`` and ``usual_on`` of ``AffectedIndex``."""
     n_words, n_rows, n_actions = -(-len(layout.outputs) // 64), int(row[-1]), len(layout.encoding.action_class)
     n_tables = n_actions if n_actions * n_rows * n_words <= MOST_WORDS else 1
     touched = np.zeros((n_tables, n_rows, n_words), dtype=np.uint64)
     by_adjacency = np.zeros((n_tables, len(layout.adjacencies), n_words), dtype=np.uint64)
-    nothing, on = np.zeros(layout.n_factors, dtype=np.int64), np.zeros(n_features(layout), dtype=np.bool_)
+    zeros, on = np.zeros(layout.n_factors, dtype=np.int64), np.zeros(n_features(layout), dtype=np.bool_)
     always = np.zeros((n_actions, n_words), dtype=np.uint64)
-    _usual(layout, graphs, nothing, on, always)
-    _dependents(layout, graphs, row, nothing, on, touched, by_adjacency)
-    show(nothing, 0, layout, on)
+    _usual(layout, graphs, zeros, on, always)
+    _dependents(layout, graphs, row, zeros, on, touched, by_adjacency)
+    show(zeros, 0, layout, on)
     on[len(layout.factor) : len(layout.factor) + layout.encoding.n_features] = False
     return always, touched, by_adjacency, on
 
 
 @compiled
 def set_bit(words: Words, variable: int) -> None:
-    """Adds a unit to a set [W]."""
+    """Adds a variable to a set [W]."""
     words[variable >> 6] |= np.uint64(1) << np.uint64(variable & 63)
 
 
 @compiled
-def _usual(layout: Layout, graphs: Graphs, nothing: Ints, on: Bools, always: Words) -> None:
-    """Fills ``always``; see Lean."""
+def _usual(layout: Layout, graphs: Graphs, zeros: Ints, on: Bools, always: Words) -> None:
+    """Fills ``always``; see ``AffectedIndex``."""
     values, rates = np.zeros(len(layout.outputs), dtype=np.int64), np.zeros(graphs.start[-1], dtype=np.float64)
-    everything = np.arange(len(layout.outputs))
+    every_variable = np.arange(len(layout.outputs))
     for action in range(len(layout.encoding.action_class)):
-        show(nothing, action, layout, on)
-        distributions(everything, nothing, action, layout, graphs, on, values, rates)
+        show(zeros, action, layout, on)
+        distributions(every_variable, zeros, action, layout, graphs, on, values, rates)
         for variable in graphs.changing:
             start = graphs.start[variable]
             if layout.mutex_of[variable] >= 0:
@@ -176,11 +176,11 @@ def _usual(layout: Layout, graphs: Graphs, nothing: Ints, on: Bools, always: Wor
 
 
 @compiled
-def _dependents(layout: Layout, graphs: Graphs, row: Ints, nothing: Ints, on: Bools, touched: Words, by_adjacency: Words) -> None:
-    """Fills the last two arguments; see Lean.
+def _dependents(layout: Layout, graphs: Graphs, row: Ints, zeros: Ints, on: Bools, touched: Words, by_adjacency: Words) -> None:
+    """Fills the last two arguments; see ``AffectedIndex``.
 
-    Where everything is 0, a unit's graphs are followed to their usual leaves; as long as the columns asked on these ways are as
-    usual, nothing else can be found. So only these touch the unit.
+    In the all-zero state every graph follows a default path. A variable's distribution can change only if a feature tested on
+    that path changes; only these features affect the variable.
     """
     first_action, first_adjacency = len(layout.factor), len(layout.factor) + layout.encoding.n_features
     for variable in range(len(layout.outputs) - 2):
@@ -191,7 +191,7 @@ def _dependents(layout: Layout, graphs: Graphs, row: Ints, nothing: Ints, on: Bo
                         set_bit(touched[table, r], variable)
     for action in range(len(layout.encoding.action_class)):
         table = action if len(touched) > 1 else 0
-        show(nothing, action, layout, on)
+        show(zeros, action, layout, on)
         for variable in graphs.changing:
             pair = graphs.pairs[variable] + layout.encoding.action_class[action] * layout.outputs[variable]
             for entry in range(graphs.entries[pair], graphs.entries[pair + 1]):
@@ -207,7 +207,7 @@ def _dependents(layout: Layout, graphs: Graphs, row: Ints, nothing: Ints, on: Bo
 
 @compiled
 def _touch(feature: int, variable: int, layout: Layout, row: Ints, touched: Words) -> None:
-    """Adds a unit to what those values of a column's factor touch that show the column otherwise than 0 does."""
+    """Adds a variable to the sets of the values for which a feature differs from its state at value 0."""
     factor, usual = layout.factor[feature], layout.value[feature] <= 0 <= layout.top[feature]
     for r in range(row[factor] + 1, row[factor + 1]):
         value = r - row[factor]
@@ -217,7 +217,7 @@ def _touch(feature: int, variable: int, layout: Layout, row: Ints, touched: Word
 
 @inlined
 def show_state(state: Ints, shown: Ints, features: Ints, different: Ints, on: Bools) -> int:
-    """Writes factors that are not 0 to ``different`` and shows their columns; returns how many."""
+    """Writes the factors that are not 0 to ``different`` and their features to ``on``; returns how many factors there are."""
     n = 0
     for factor in range(len(state)):
         value = state[factor]
@@ -244,7 +244,7 @@ def affected_variables_of(
     words: Words,
     variables: Ints,
 ) -> int:
-    """Writes the units that do anything unusual to ``variables``, ascending; returns how many there are."""
+    """Writes the affected variables to ``variables``, ascending; returns how many there are."""
     table, n_words, n = action if len(touched) > 1 else 0, len(words), 0
     for j in range(n_words):
         words[j] = always[action, j]
@@ -271,7 +271,7 @@ def affected_variables_of(
 
 @inlined
 def value_of(variable: int, state: Ints, variables: Ints, members: Ints) -> int:
-    """A unit's present value."""
+    """A variable's current value."""
     first, n = variables[variable, FIRST], variables[variable, MEMBERS]
     if n == 1:
         return int(state[members[first]])
@@ -300,20 +300,20 @@ def rates_of(
     values: Ints,
     out: Floats,
 ) -> None:
-    """As ``compiled.distributions``, of the touched units; writes their present values to ``values``, in their order."""
+    """As ``arrays.distributions``, of the affected variables; writes their current values to ``values``, in the same order."""
     for i in range(len(touched)):
         variable = touched[i]
         n, start, value = variables[variable, OUTPUTS], variables[variable, START], value_of(variable, state, variables, members)
         values[i] = value
         pair = variables[variable, PAIR] + action_class * n + value
         begins, ends = entries[pair], entries[pair + 1]
-        total, slack, asked = 0.0, 0.0, False
+        total, slack, tested = 0.0, 0.0, False
         for k in range(start, start + n):
             out[k] = 0.0
         for e in range(begins, ends):
             node = entry[e, 1]
-            asked |= nodes[node, 0] >= 0
-            while nodes[node, 0] >= 0:  # without a branch, which a processor could not foresee
+            tested |= nodes[node, 0] >= 0
+            while nodes[node, 0] >= 0:  # without a branch, which the processor could not predict
                 node = nodes[node, 1 + np.int64(on[nodes[node, 0]])]
             rate = without_noise(leaf[node, 0], leaf[node, 1], n, noise)
             out[start + entry[e, 0]] = rate
@@ -324,18 +324,19 @@ def rates_of(
             rate = out[start + 1] if ends > begins else usual if value == 0 else 1.0 - usual
             out[start], out[start + 1] = 1.0 - rate, rate
             continue
-        with_rest(out, base, start, n, value, total, slack, smoothing[pair, 0], smoothing[pair, 1], ends > begins, asked, noise)
+        with_rest(out, base, start, n, value, total, slack, smoothing[pair, 0], smoothing[pair, 1], ends > begins, tested, noise)
 
 
 def only_end_is_synchronic(layout: Layout, synchronic: Graphs) -> bool:
-    """Whether nothing is drawn late but the end."""
+    """Whether no variable but ``terminated`` has synchronic arcs."""
     return bool((synchronic.changing == len(layout.outputs) - 2).all())
 
 
 def end_graph(layout: Layout, synchronic: Graphs) -> tuple[Ints, NDArray[np.int32], Floats]:
-    """The graph of the end: first node of each way, -1 where it never came, [W]; nodes (column, off, on) and their rates.
+    """The graph of ``terminated``: first node of each action class, nodes (feature, off, on) and their rates.
 
-    Nothing where the end is not drawn late.
+    The first node is -1 for a class under which no episode ended, int64 [classes]. All arrays are empty if ``terminated`` has no
+    synchronic arcs.
     """
     if len(synchronic.changing) == 0:
         return np.zeros(0, dtype=np.int64), np.zeros((0, 3), dtype=np.int32), np.zeros(0)
@@ -365,17 +366,17 @@ def end_rate(
     cells: Ints,
     next_adjacencies: Ints,
 ) -> float:
-    """Probability that the episode ends with this next state [F]; ``on`` are the columns of the state before, [D]."""
+    """Probability that the episode ends with this next state [F]; ``on`` are the features of the current state, [D]."""
     if node < 0:
         return otherwise
     while nodes[node, 0] >= 0:
         feature = nodes[node, 0]
         if feature < len(on):
-            asked = on[feature]
+            is_on = on[feature]
         elif feature < len(on) + len(factor):
             c = feature - len(on)
-            asked = features[c, 0] <= following[factor[c]] <= features[c, 1]
+            is_on = features[c, 0] <= following[factor[c]] <= features[c, 1]
         else:
-            asked = are_adjacent(following, cells, next_adjacencies[feature - len(on) - len(factor)])
-        node = nodes[node, 2] if asked else nodes[node, 1]
+            is_on = are_adjacent(following, cells, next_adjacencies[feature - len(on) - len(factor)])
+        node = nodes[node, 2] if is_on else nodes[node, 1]
     return float(rate[node])

@@ -1,4 +1,4 @@
-"""Decision graphs as flat arrays: nodes ask for a column, contexts with equal rates share a leaf.
+"""Decision graphs as flat arrays: nodes test a feature, and contexts with equal rates share a leaf.
 
 After Chickering, Heckerman and Meek 1997, "A Bayesian approach to learning Bayesian networks with local structure".
 """
@@ -20,25 +20,26 @@ from mbagent_envs.jit import compiled, inlined
 
 
 class Graphs(NamedTuple):
-    """The graphs of all units.
+    """The graphs of all variables.
 
     Attributes:
-        changing: units that have graphs, int64.
+        changing: variables that have graphs, int64.
         pairs: where each variable's pairs (action class, value) begin, int64 [U + 1]; the number of a pair within a variable is
             ``action_class * cardinality + value``, see ``features.ActionEncoding``.
         entries: where the entries of each pair begin, int64 [pairs + 1].
-        values: the value that an entry is about, int64 [E].
+        values: the value whose probability an entry predicts, int64 [E].
         nodes: its first node, int64 [E].
-        feature: what a node asks for, -1 at a leaf, int64 [nodes].
+        feature: the feature that a node tests, -1 at a leaf, int64 [nodes].
         off, on: next node, int64 [nodes].
         rate: probability at a leaf, [nodes].
-        spread: standard error of a leaf's rate, 0 where all its rows agree, [nodes].
-        persistence: share of a pair's rows in which the unit kept its value, [pairs]; 1 where there are none.
-        unseen_mass: probability that what follows a pair is none of what was seen to follow it, [pairs].
-        base: where the novelties of each unit are drawn from, after ``start`` [U + 1], [sum of cardinalities].
-        still: probability that a unit without graphs changes, [1].
-        noise: 0, or for planning: values no observation stands behind count as impossible where they are less probable than
-            this share of the likeliest, [1].
+        spread: standard error of a leaf's rate, 0 if all its rows agree, [nodes].
+        persistence: share of a pair's rows in which the variable kept its value, [pairs]; 1 without rows.
+        unseen_mass: probability of values never observed after a pair, [pairs].
+        start: where each variable's values begin in ``base``, int64 [U + 1].
+        base: distribution of each variable's unseen values, [sum of cardinalities].
+        still: probability that a variable without graphs changes, [1].
+        noise: 0, or for planning: values without any observation count as impossible if they are less probable than this share
+            of the most probable value, [1].
     """
 
     changing: Ints
@@ -73,7 +74,7 @@ class Nodes:
         return len(self.links) - 1
 
     def graph(self, search: Search, prior: LeafPrior) -> Ints:
-        """Adds a head's graph; returns the first node of each of its first contexts."""
+        """Adds a target's graph; returns the first node of each of its initial contexts."""
         n, e = search.counts()
         rates = prior.rates(n, e, search.prior_mean)
         spreads = np.sqrt(e * (n - e) / np.maximum(n, 1) ** 3)
@@ -89,7 +90,7 @@ class Nodes:
 def linked(
     entries: Ints | Sequence[tuple[int, int, int]], n_pairs: int, links: Sequence[tuple[int, int, int]]
 ) -> tuple[Ints, Ints, Ints, Ints, Ints, Ints]:
-    """The arrays from ``entries`` to ``on`` of Graphs, from entries (pair, value, node) and nodes (column, off, on)."""
+    """The arrays from ``entries`` to ``on`` of ``Graphs``, from entries (pair, value, node) and nodes (feature, off, on)."""
     table = np.asarray(entries, dtype=np.int64).reshape(-1, 3)
     table = table[np.lexsort(table.T[::-1])]
     parts = np.asarray(links, dtype=np.int64).reshape(-1, 3)
@@ -102,14 +103,14 @@ def linked(
 def build(
     layout: Layout, asked: Sequence[Question], found: Sequence[Search], smoothings: Sequence[Smoothing], still: float
 ) -> Graphs:
-    """All graphs.
+    """The graphs of all variables.
 
     Args:
-        layout: the units.
+        layout: the variables.
         asked: the questions.
-        found: what was found for each.
-        smoothings: of each unit.
-        still: probability that a unit without graphs changes.
+        found: the finished search for each question.
+        smoothings: of each variable.
+        still: probability that a variable without graphs changes.
     """
     nodes, prior = Nodes(), fitted_prior(found)
     pairs = np.concatenate([[0], np.cumsum(layout.encoding.n_action_classes * layout.outputs)]).astype(np.int64)
@@ -121,8 +122,8 @@ def build(
             with_operand.setdefault(question.variable, []).append((question, first))
         else:
             entries.append(np.stack([pairs[question.variable] + question.pairs, question.values, first], axis=1))
-    for variable, answered in with_operand.items():
-        entries += _by_operand(nodes, answered, pairs[variable], int(layout.outputs[variable]), layout.encoding.n_action_classes)
+    for variable, questions in with_operand.items():
+        entries += _by_operand(nodes, questions, pairs[variable], int(layout.outputs[variable]), layout.encoding.n_action_classes)
     rates = np.asarray(nodes.rates, dtype=np.float64).reshape(-1, 2)
     return Graphs(
         np.asarray(sorted({question.variable for question in asked}), dtype=np.int64),
@@ -140,11 +141,11 @@ def build(
 
 
 def _by_operand(
-    nodes: Nodes, answered: Sequence[tuple[Question, Ints]], begin: int, cardinality: int, n_action_classes: int
+    nodes: Nodes, questions: Sequence[tuple[Question, Ints]], begin: int, cardinality: int, n_action_classes: int
 ) -> list[Ints]:
-    """Entries (pair, value, node) [N, 3] of a unit that has a partner: what the action is, nodes ask for if at all."""
-    rows = [np.stack([*np.divmod(q.pairs, cardinality), q.values, first], axis=1) for q, first in answered]
-    features = answered[0][0].operand
+    """Entries (pair, value, node) [N, 3] of a variable with an operand, the same for all action classes."""
+    rows = [np.stack([*np.divmod(q.pairs, cardinality), q.values, first], axis=1) for q, first in questions]
+    features = questions[0][0].operand
     assert features is not None
     now, value, node = chained(np.concatenate(rows), features, nodes.add, nodes.add(-1, 0, 0)).T
     return [np.stack([begin + action_class * cardinality + now, value, node], axis=1) for action_class in range(n_action_classes)]
@@ -152,7 +153,7 @@ def _by_operand(
 
 @compiled
 def read(state: Ints, variable: int, layout: Layout) -> int:
-    """Value of a unit in a state [F]; 0 for ``terminated`` and the event."""
+    """Value of a variable in a state [F]; 0 for ``terminated`` and the reset."""
     first, last = layout.first[variable], layout.first[variable + 1]
     if last - first == 1:
         return int(state[layout.members[first]])
@@ -164,18 +165,18 @@ def read(state: Ints, variable: int, layout: Layout) -> int:
 
 @compiled
 def write(state: Ints, variable: int, value: int, layout: Layout) -> None:
-    """Sets a unit's value in a state [F]."""
+    """Sets a variable's value in a state [F]."""
     first, last = layout.first[variable], layout.first[variable + 1]
     if last - first == 1:
         state[layout.members[first]] = value
     elif last > first:
-        for member in range(first, last):  # all of them: a state may have come with several on
+        for member in range(first, last):  # all of them: a given state may have several bits on
             state[layout.members[member]] = 1 if member == first + value else 0
 
 
 @compiled
 def show(state: Ints, action: int, layout: Layout, on: Bools) -> None:
-    """Writes which columns are on to ``on`` [D]."""
+    """Writes the features of a state [F] and an action to ``on`` [D]."""
     n = len(layout.factor)
     for feature in range(n):
         value = state[layout.factor[feature]]
@@ -191,7 +192,7 @@ def show(state: Ints, action: int, layout: Layout, on: Bools) -> None:
 
 @compiled
 def are_adjacent(state: Ints, cells: Ints, adjacency: Ints) -> bool:
-    """Whether a meeting (see ``features.Layout``) takes place in a state [F]."""
+    """Whether an adjacency (see ``features.Layout``) occurs in a state [F]."""
     _, height, width = cells.shape
     below, right = adjacency[4], adjacency[5]
     for y in range(height):
@@ -209,13 +210,13 @@ def are_adjacent(state: Ints, cells: Ints, adjacency: Ints) -> bool:
 
 @compiled
 def n_features(layout: Layout) -> int:
-    """Number of columns D."""
+    """Number of features D."""
     return len(layout.factor) + layout.encoding.n_features + len(layout.adjacencies)
 
 
 @compiled
 def show_next(following: Ints, layout: Layout, on: Bools) -> None:
-    """Writes which columns a next state [F] has on, after those of the state in ``on``."""
+    """Writes the features of a next state [F] to ``on``, after those of the current state."""
     n = n_features(layout)
     for feature in range(len(layout.factor)):
         value = following[layout.factor[feature]]
@@ -224,7 +225,7 @@ def show_next(following: Ints, layout: Layout, on: Bools) -> None:
 
 @compiled
 def show_next_adjacencies(following: Ints, layout: Layout, on: Bools) -> None:
-    """Writes what meets what in a next state [F], after all other columns."""
+    """Writes the adjacency features of a next state [F] to ``on``, after all other features."""
     n = n_features(layout) + len(layout.factor)
     for m in range(len(layout.next_adjacencies)):
         on[n + m] = are_adjacent(following, layout.cells, layout.next_adjacencies[m])
@@ -232,9 +233,10 @@ def show_next_adjacencies(following: Ints, layout: Layout, on: Bools) -> None:
 
 @inlined
 def without_noise(rate: float, spread: float, n: int, noise: float) -> float:
-    """A leaf's rate for planning, of one of ``n`` values; negative where it counts only if it is not negligible.
+    """A leaf's rate for planning, of one of ``n`` values; negative if it counts only unless it is negligible.
 
-    Leaves whose rows all agree, as ``spread`` tells, are sure. Bits are decided at once, other values once all are known.
+    If all rows of a leaf agree (``spread`` 0), its outcome is taken as certain. For bits this is decided here; for variables of
+    more values, in ``with_rest``, when the rates of all values are known.
     """
     if noise == 0.0 or spread > 0.0:
         return rate
@@ -260,11 +262,12 @@ def with_rest(
     asked: bool,
     noise: float,
 ) -> None:
-    """Completes a unit's distribution, ``out`` from ``start`` on, by the present value and by what never came.
+    """Completes a variable's distribution, ``out`` from ``start`` on, with the current value and the unseen values.
 
-    The graphs give the rates of all values but the present one, which has the rest. Where the unit was never seen to stay, the
-    rest is taken for an error of estimation unless it is larger than such an error can be; for planning, also where graphs ask
-    for anything (``asked``), so that rows in which it stayed may have been others, and it is much less than in all rows.
+    The graphs give the rates of all values but the current one, which gets the remaining probability. If the variable was never
+    observed to keep its value, the remainder counts as an estimation error unless it exceeds ``slack``. For planning, it also
+    counts as one if graphs test features (``asked``) and the remainder is at most ``slack`` and less than half of
+    ``persistence``: the rows in which the value was kept may belong to other leaves.
     """
     stay = 1.0 - total
     observed = not known or (persistence > 0.0 and (stay > slack or not asked or stay >= 0.5 * persistence))
@@ -286,9 +289,9 @@ def with_rest(
 def distributions(
     variables: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs, on: Bools, values: Ints, out: Floats
 ) -> None:
-    """Writes value and next distribution of some units to ``values`` [U] and, from ``start[variable]`` on, to ``out``.
+    """Writes value and next distribution of some variables to ``values`` [U] and, from ``start[variable]`` on, to ``out``.
 
-    All units are done in one call: handing the graphs over costs more than a unit does.
+    One call handles all variables, since passing the graphs costs more than evaluating a variable.
     """
     for variable in variables:
         first, n, start = layout.first[variable], layout.outputs[variable], graphs.start[variable]
@@ -301,12 +304,12 @@ def distributions(
         values[variable] = value
         noise = graphs.noise[0]
         pair = graphs.pairs[variable] + layout.encoding.action_class[action] * n + value
-        total, slack, asked = 0.0, 0.0, False
+        total, slack, tested = 0.0, 0.0, False
         for k in range(start, start + n):
             out[k] = 0.0
         for entry in range(graphs.entries[pair], graphs.entries[pair + 1]):
             node = graphs.nodes[entry]
-            asked |= graphs.feature[node] >= 0
+            tested |= graphs.feature[node] >= 0
             while graphs.feature[node] >= 0:
                 node = graphs.on[node] if on[graphs.feature[node]] else graphs.off[node]
             rate = without_noise(graphs.rate[node], graphs.spread[node], n, noise)
@@ -315,8 +318,8 @@ def distributions(
             slack += 3.0 * graphs.spread[node]
         known = graphs.entries[pair + 1] > graphs.entries[pair]
         if n == 2:
-            still = graphs.still[0] if graphs.still[0] >= noise else 0.0
-            rate = out[start + 1] if known else still if value == 0 else 1.0 - still
+            change = graphs.still[0] if graphs.still[0] >= noise else 0.0
+            rate = out[start + 1] if known else change if value == 0 else 1.0 - change
             out[start], out[start + 1] = 1.0 - rate, rate
             continue
         with_rest(
@@ -330,6 +333,6 @@ def distributions(
             graphs.persistence[pair],
             graphs.unseen_mass[pair],
             known,
-            asked,
+            tested,
             noise,
         )

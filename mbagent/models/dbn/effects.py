@@ -1,8 +1,8 @@
 """Effect parametrisations of ordinal variables: the next value, its change, or its deviation from a sum.
 
-Held-out transitions decide which one is used. The second operand of a sum is the action's number, that of a part of the action,
-or another factor's value, as in stock plus order minus demand. For saturating sums such as inventory levels the distribution of
-the residual is shared by all (stock, order) pairs; at a bound, only the unclipped sum is relevant.
+Held-out transitions decide which one is used. The second operand of a sum is the action's number, an action component, or another
+factor's value, as in stock plus order minus demand. For saturating sums such as inventory levels, the distribution of the
+residual is shared by all (stock, order) pairs; at a bound, only the unclipped sum is relevant.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from mbagent.models.held_out import FORETOLD, better, thinned
 from mbagent.types import Bools, Floats, Ints
 
 SURE_GAIN = 5.0
-"""Standard errors by which the slope of a partner must differ from zero."""
+"""Standard errors by which the slope of an operand must differ from zero."""
 
 MOST_LOOKED_AT = 5000
-"""Rows that are looked at."""
+"""Maximum number of rows in the regression for operands."""
 
 MOST_CANDIDATES = 200
-"""Ordered factors and parts of actions; where there are more, no partners are looked for."""
+"""Maximum number of ordered factors and action components; with more, no operands are searched for."""
 
 MOST_NODES = 50_000
-"""Nodes that a sum with a partner may take: its values times the factor's, times how many steps from the sum that ends."""
+"""Maximum number of nodes for a sum with an operand: its values times the factor's, times the number of different residuals."""
 
 
 @dataclass(frozen=True)
 class Operand:
-    """A factor, the action, or a part of it.
+    """Second operand of a sum: a factor, the action, or an action component.
 
     Attributes:
         cardinality: number of its values.
         factor: number of the factor, or -1.
-        stride: of the action's part: it is ``action // stride % cardinality``.
-        feature: number of the part's first column among those of actions.
-        whole: whether it is the action, which is one thing.
+        stride: of an action component: its value is ``action // stride % cardinality``.
+        feature: number of the component's first feature among those of actions.
+        whole: whether it is the action itself, which has no components.
     """
 
     cardinality: int
@@ -57,7 +57,7 @@ class Operand:
         return np.asarray(found, dtype=np.int64)
 
     def features(self, layout: Layout) -> Ints:
-        """The column that is on where it has each value, int64 [cardinality]."""
+        """Number of the feature of each of its values, int64 [cardinality]."""
         if self.factor >= 0:
             own = (layout.factor == self.factor) & (layout.value == layout.top)
             return np.flatnonzero(own)[np.argsort(layout.value[own])]
@@ -65,20 +65,20 @@ class Operand:
 
 
 def candidates(cardinalities: Sequence[int], parts: Sequence[int]) -> list[Operand]:
-    """All factors with an order, and all parts of the action that have one; what is on or off has none."""
+    """Possible operands: all factors and action components with more than two values."""
     factors = [Operand(n, factor=f) for f, n in enumerate(cardinalities) if n > 2]
     features = enumerate(action_features(parts))
     return factors + [Operand(n, -1, stride, i, len(parts) == 1) for i, (stride, n, value) in features if n > 2 and value == 0]
 
 
 def likely_operands(factors: Sequence[int], among: Sequence[Operand], rows: TransitionBatch) -> list[tuple[Operand, int] | None]:
-    """For each factor the partner that its change most surely rises (1) or falls (-1) with; None if with none.
+    """Most significant operand of each factor's change, with the sign of its slope (1 or -1); None if none is significant.
 
-    All other candidates are held constant: least squares, with t statistics.
+    The slopes are those of a least-squares regression on all candidates together; significance is by t statistics.
 
     Args:
         factors: numbers of factors that are among the candidates themselves.
-        among: the candidates.
+        among: the candidate operands.
         rows: N transitions.
     """
     some = thinned(rows, MOST_LOOKED_AT)
@@ -90,8 +90,8 @@ def likely_operands(factors: Sequence[int], among: Sequence[Operand], rows: Tran
     change -= change.mean(axis=0)
     inverse = np.linalg.pinv(x.T @ x)
     slopes = inverse @ (x.T @ change)
-    left = ((change - x @ slopes) ** 2).sum(axis=0) / (len(some) - len(among) - 1)
-    t = slopes / np.sqrt(np.outer(np.diag(inverse), left) + 1e-12)
+    residual = ((change - x @ slopes) ** 2).sum(axis=0) / (len(some) - len(among) - 1)
+    t = slopes / np.sqrt(np.outer(np.diag(inverse), residual) + 1e-12)
     found: list[tuple[Operand, int] | None] = []
     for i, factor in enumerate(factors):
         own = [operand.factor == factor for operand in among]
@@ -103,22 +103,22 @@ def likely_operands(factors: Sequence[int], among: Sequence[Operand], rows: Tran
 
 
 def _entries(operand: Operand, sign: int, factor: Operand, rows: TransitionBatch) -> int:
-    """Number of nodes that a factor's sum with its partner takes, at most; with the action none."""
-    far = rows.after[:, factor.factor].astype(np.int64) - factor.of(rows) - sign * operand.of(rows)
-    return factor.cardinality * operand.cardinality * (len(np.unique(far)) + 2) * (not operand.whole)
+    """Upper bound on the nodes that a factor's sum with its operand needs; none if the operand is the whole action."""
+    residual = rows.after[:, factor.factor].astype(np.int64) - factor.of(rows) - sign * operand.of(rows)
+    return factor.cardinality * operand.cardinality * (len(np.unique(residual)) + 2) * (not operand.whole)
 
 
 def chained(entries: Ints, features: Ints, add: Callable[[int, int, int], int], zero: int) -> Ints:
-    """One node for each (present value, value) that leads on by the partner's value.
+    """Chains of nodes, one for each (current value, next value), that select the node of the operand's value.
 
     Args:
-        entries: (partner's value, present value, value, node), int64 [N, 4].
-        features: the partner's.
-        add: adds a node (column, off, on) and returns its number.
-        zero: node for the partner's values of which there is no entry.
+        entries: (operand's value, current value, next value, node), int64 [N, 4].
+        features: those of the operand's values.
+        add: adds a node (feature, off, on) and returns its number.
+        zero: node for values of the operand without an entry.
 
     Returns:
-        (present value, value, node) of each, int64 [M, 3].
+        (current value, next value, first node) of each chain, int64 [M, 3].
     """
     found: dict[tuple[int, int], int] = {}
     for operand, now, value, node in entries.tolist():
@@ -127,7 +127,7 @@ def chained(entries: Ints, features: Ints, add: Callable[[int, int, int], int], 
 
 
 def for_all_actions(smoothing: Smoothing, n_operand: int, n_action_classes: int) -> Smoothing:
-    """A habit by pairs (partner's value, value), as one by pairs (way, value)."""
+    """Smoothing by (operand's value, value) pairs converted to (action class, value) pairs."""
     persistence, unseen_mass = (
         np.tile(array.reshape(n_operand, -1).max(axis=0), n_action_classes)
         for array in (smoothing.persistence, smoothing.unseen_mass)
@@ -136,13 +136,13 @@ def for_all_actions(smoothing: Smoothing, n_operand: int, n_action_classes: int)
 
 
 SELDOM = 1e-9
-"""Share of rows in which a value is kept that a sum may lead back to: whatever the other values leave."""
+"""Persistence assumed for values that a sum can lead back to: the current value gets what the other values leave."""
 
 
 class Effect(Enum):
-    """How a factor is asked about; a sum or a difference is that of its value and the action's number, or its partner's.
+    """Targets of a factor: the next value, its change, or its deviation from a sum or difference with an operand.
 
-    What is beyond the bounds counts in some sums, and is lost before luck comes in others: those fill or drain.
+    Clipped sums and differences are limited to the factor's bounds before the random deviation is added; others are not.
     """
 
     ABSOLUTE = "goes"
@@ -153,29 +153,29 @@ class Effect(Enum):
     CLIPPED_DIFFERENCE = "drains"
 
     def sum_of(self, values: Ints, actions: Ints, last: int) -> Ints:
-        """The sum of present values and the actions' numbers, or their difference."""
+        """Sums or differences of current values and operands, limited to 0 ... ``last`` if clipped."""
         sums = values + actions if self in (Effect.SUM, Effect.CLIPPED_SUM) else values - actions
         return np.clip(sums, 0, last) if self in (Effect.CLIPPED_SUM, Effect.CLIPPED_DIFFERENCE) else sums
 
 
 class EffectModel(NamedTuple):
-    """A manner, and what sums are with; None for the number of the action's way."""
+    """An effect with the operand of its sum; None for the number of the action class."""
 
     effect: Effect
     operand: Operand | None = None
 
 
 ABSOLUTE_EFFECT = EffectModel(Effect.ABSOLUTE)
-"""Where it goes."""
+"""The targets are the next values."""
 
 SUM_EFFECTS = (Effect.SUM, Effect.DIFFERENCE, Effect.CLIPPED_SUM, Effect.CLIPPED_DIFFERENCE)
-"""Manners that ask of sums."""
+"""Effects that are sums or differences."""
 
 SUM_ERRORS = 1.0
-"""Standard errors by which a sum must foretell held-out values better: what an action's number is may mean nothing."""
+"""Standard errors by which a sum must improve held-out likelihood, since the numbers of actions may be arbitrary."""
 
 ENOUGH_HELD_OUT, MOST_EFFECT_FOLDS = 1000, 6
-"""So many held-out rows tell which manner fits; where there are fewer, others are held out, too, so many times in all."""
+"""Held-out rows that are enough to choose an effect; with fewer, further folds are held out, up to this number in all."""
 
 
 def best_effect_models(
@@ -183,22 +183,22 @@ def best_effect_models(
     n_factors: int,
     operands: Callable[[], Sequence[tuple[Operand, int] | None]],
 ) -> list[EffectModel]:
-    """How each of K factors is foretold best; sums are looked at where something is left to foretell.
+    """Effect of each of K factors with the best held-out likelihood; sums are tried only for unpredictable factors.
 
     Args:
-        log_probs: log-probabilities of held-out next values, each factor being asked about in some way, [N, K].
+        log_probs: log-probabilities of held-out next values under given effects of the factors, [N, K].
         n_factors: K.
-        operands: the likeliest of each factor, and whether it is added (1) or taken away (-1).
+        operands: the most significant operand of each factor, and whether it is added (1) or subtracted (-1).
     """
-    logs, moves = (log_probs([effect_model] * n_factors) for effect_model in (ABSOLUTE_EFFECT, EffectModel(Effect.RELATIVE)))
-    moving = (moves - logs).sum(axis=0) > 0.0
-    best, logs = [EffectModel(Effect.RELATIVE) if there else ABSOLUTE_EFFECT for there in moving], np.where(moving, moves, logs)
+    logs, changes = (log_probs([effect_model] * n_factors) for effect_model in (ABSOLUTE_EFFECT, EffectModel(Effect.RELATIVE)))
+    relative = (changes - logs).sum(axis=0) > 0.0
+    best, logs = [EffectModel(Effect.RELATIVE) if r else ABSOLUTE_EFFECT for r in relative], np.where(relative, changes, logs)
     random = np.flatnonzero(logs.mean(axis=0) < FORETOLD).tolist()
     likely = operands() if random else []
     if not any(likely[i] for i in random):
         return best
     rounds = [
-        [_summed(effects, *one) if one else usual for one, usual in zip(likely, best, strict=True)]
+        [_sum_effect(effects, *one) if one else usual for one, usual in zip(likely, best, strict=True)]
         for effects in ((Effect.SUM, Effect.DIFFERENCE), (Effect.CLIPPED_SUM, Effect.CLIPPED_DIFFERENCE))
     ]
     sums = np.stack([log_probs(effect_models) for effect_models in rounds])
@@ -209,13 +209,13 @@ def best_effect_models(
     return best
 
 
-def _summed(effects: tuple[Effect, Effect], operand: Operand, sign: int) -> EffectModel:
-    """How to ask about a sum with a partner, or a difference; actions are in all questions as it is."""
+def _sum_effect(effects: tuple[Effect, Effect], operand: Operand, sign: int) -> EffectModel:
+    """The sum or difference with an operand; the whole action needs none, since it is part of every pair."""
     return EffectModel(effects[sign < 0], None if operand.whole else operand)
 
 
 def more_folds(train: TransitionBatch, held_out: TransitionBatch) -> list[Bools]:
-    """Which rows to hold out, besides those that are, where these are too few to tell manners apart, [folds][N]."""
+    """Rows of further folds to hold out if the held-out rows are too few to choose an effect, bool [folds][N]."""
     if (n := len(train) // MOST_EFFECT_FOLDS) == 0:
         return []
     folds = min(MOST_EFFECT_FOLDS - 1, -(-(ENOUGH_HELD_OUT - len(held_out)) // n))
@@ -223,70 +223,70 @@ def more_folds(train: TransitionBatch, held_out: TransitionBatch) -> list[Bools]
 
 
 def questions_for_effect(effect: Effect, variable: int, cardinality: int, n_actions: int, observed: Observed) -> list[Question]:
-    """The questions about one unit; none if it never changes.
+    """The questions about one variable under an effect; none if it never changes.
 
     Args:
-        effect: how to ask; units of two values are asked where they go.
+        effect: the effect; variables of two values always have absolute effects.
         variable: its number.
         cardinality: number of its values.
-        n_actions: number of ways of actions, met or not.
-        observed: the rows to ask.
+        n_actions: number of action classes (or values of the operand), observed or not.
+        observed: its transitions.
     """
     if effect is Effect.ABSOLUTE or cardinality == 2 or (observed.now == observed.then).all():
         return ask(variable, cardinality, observed)
     return (
-        _sums(effect, variable, cardinality, n_actions, observed)
+        _sum_questions(effect, variable, cardinality, n_actions, observed)
         if effect in SUM_EFFECTS
-        else _moves(variable, cardinality, observed)
+        else _change_questions(variable, cardinality, observed)
     )
 
 
-def _moves(variable: int, cardinality: int, observed: Observed) -> list[Question]:
-    """How far a unit moves under the actions that ever moved it so far, whatever its present value, met or not.
+def _change_questions(variable: int, cardinality: int, observed: Observed) -> list[Question]:
+    """Questions about each observed change of a variable, under the actions after which it was observed.
 
-    After the last value comes the first.
+    They apply to all current values, observed or not. Changes are modulo the cardinality.
     """
-    far, asked = (observed.then - observed.now) % cardinality, []
-    for move in np.unique(far[far > 0]):
-        leading = np.unique(observed.actions[far == move])
-        rows = np.flatnonzero(np.isin(observed.actions, leading))
-        every = (leading[:, None] * cardinality + np.arange(cardinality)).ravel()
-        one = question(variable, far[rows], int(move), cardinality, observed.select(rows), every)
-        asked.append(replace(one, values=(every % cardinality + move) % cardinality))
-    return asked
+    changes, questions = (observed.then - observed.now) % cardinality, []
+    for change in np.unique(changes[changes > 0]):
+        actions = np.unique(observed.actions[changes == change])
+        rows = np.flatnonzero(np.isin(observed.actions, actions))
+        every = (actions[:, None] * cardinality + np.arange(cardinality)).ravel()
+        one = question(variable, changes[rows], int(change), cardinality, observed.select(rows), every)
+        questions.append(replace(one, values=(every % cardinality + change) % cardinality))
+    return questions
 
 
-def _sums(effect: Effect, variable: int, cardinality: int, n_actions: int, observed: Observed) -> list[Question]:
-    """How far from the sum a unit ends within its bounds, and for either bound whether it ends there, given the sum.
+def _sum_questions(effect: Effect, variable: int, cardinality: int, n_actions: int, observed: Observed) -> list[Question]:
+    """Questions about each deviation from the sum within the bounds, and for either bound, given the sum.
 
-    Sums that were never met are taken for the nearest one that was.
+    For the latter, sums that were never observed are replaced by the nearest observed one.
     """
     last, every = cardinality - 1, np.arange(n_actions * cardinality)
     sums, here = (
         effect.sum_of(*of, last) for of in ((every % cardinality, every // cardinality), (observed.now, observed.actions))
     )
-    inside, asked = (observed.then > 0) & (observed.then < last), []
-    for far in np.unique((observed.then - here)[inside]):
-        rows = np.flatnonzero((here + far > 0) & (here + far < last))
-        there = (sums + far > 0) & (sums + far < last)
-        one = question(variable, (observed.then - here)[rows], int(far), cardinality, observed.select(rows), every[there])
-        asked.append(_elsewhere(replace(one, values=sums[there] + far), cardinality))
-    met = np.unique(here)
-    nearest = np.searchsorted((met[:-1] + met[1:]) / 2, sums)
+    inside, questions = (observed.then > 0) & (observed.then < last), []
+    for deviation in np.unique((observed.then - here)[inside]):
+        rows = np.flatnonzero((here + deviation > 0) & (here + deviation < last))
+        valid = (sums + deviation > 0) & (sums + deviation < last)
+        one = question(variable, (observed.then - here)[rows], int(deviation), cardinality, observed.select(rows), every[valid])
+        questions.append(_without_current_value(replace(one, values=sums[valid] + deviation), cardinality))
+    known = np.unique(here)
+    nearest = np.searchsorted((known[:-1] + known[1:]) / 2, sums)
     for bound in np.intersect1d((0, last), observed.then):
         one = question(variable, observed.then, int(bound), cardinality, observed, every, nearest)
-        asked.append(_elsewhere(one, cardinality))
-    return asked
+        questions.append(_without_current_value(one, cardinality))
+    return questions
 
 
-def _elsewhere(one: Question, cardinality: int) -> Question:
-    """The question answered for pairs with other present values only: the present one has what the others leave."""
+def _without_current_value(one: Question, cardinality: int) -> Question:
+    """The question without pairs whose current value it predicts: that value gets the remaining probability."""
     other = one.pairs % cardinality != one.values
     return replace(one, values=one.values[other], pairs=one.pairs[other], context=one.context[other])
 
 
 def smoothing_for_effect(effect: Effect, cardinality: int, n_actions: int, observed: Observed) -> Smoothing:
-    """A unit's habit where it is asked about in a manner: what the manner asks at once is counted at once, too."""
+    """Smoothing of a variable under an effect: rows that the effect pools are counted together here, too."""
     if effect is Effect.ABSOLUTE or cardinality == 2 or len(observed.now) == 0:
         return smoothing_of(cardinality, n_actions, observed.actions, observed.now, observed.then)
     every = np.arange(n_actions * cardinality)
@@ -295,10 +295,10 @@ def smoothing_for_effect(effect: Effect, cardinality: int, n_actions: int, obser
         return smoothing_of(cardinality, n_actions, observed.actions, observed.now, observed.then, pools)
     value, last = every % cardinality, cardinality - 1
     sums, here = effect.sum_of(value, every // cardinality, last), effect.sum_of(observed.now, observed.actions, last)
-    far, inside = observed.then - here, (observed.then > 0) & (observed.then < last)
-    pools = Pools(np.zeros_like(every), np.where(inside, far - far.min(), np.ptp(far) + 1 + observed.then))
+    deviation, inside = observed.then - here, (observed.then > 0) & (observed.then < last)
+    pools = Pools(np.zeros_like(every), np.where(inside, deviation - deviation.min(), np.ptp(deviation) + 1 + observed.then))
     smoothing = smoothing_of(cardinality, n_actions, observed.actions, observed.now, observed.then, pools)
-    met = np.isin(value - sums, far[inside]) & (value > 0) & (value < last)
+    possible = np.isin(value - sums, deviation[inside]) & (value > 0) & (value < last)
     for bound in (0, last):
-        met |= (value == bound) & np.isin(sums, here[observed.then == bound])
-    return replace(smoothing, persistence=np.where(met, SELDOM, 0.0))
+        possible |= (value == bound) & np.isin(sums, here[observed.then == bound])
+    return replace(smoothing, persistence=np.where(possible, SELDOM, 0.0))

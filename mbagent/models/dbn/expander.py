@@ -2,8 +2,8 @@
 
 The outcomes are those of ``successors.successors``, at a cost that grows with the number of affected variables and not with that
 of all variables. The only variable with synchronic arcs is the end of the episode; features of the next state are evaluated only
-when its graph asks for them.
-Shapes: W classes of actions, D features of the state, D' of them single factors, M adjacency features of the next state.
+when its graph tests them.
+Shapes: A actions, U variables, F factors, Q mutex groups, W words of 64 variables, D features.
 """
 
 from __future__ import annotations
@@ -49,26 +49,27 @@ from mbagent.types import Bools, Floats, Ints, Words
 from mbagent_envs.jit import compiled, inlined
 
 _SURE = 1 << 40
-"""Counted for a bit that is sure to be on."""
+"""Counted for a bit that is certain to be on."""
 
 
 class GraphWork(NamedTuple):
-    """Work space; ``on`` is between two calls as where everything is 0.
+    """Work space; between two calls, ``on`` has the features of the all-zero state.
 
     Attributes:
-        on: columns, bool [D].
-        rates: distributions of the touched units, [sum of cardinalities].
-        joint: that of a unit or coupling.
+        on: features, bool [D].
+        rates: distributions of the affected variables, [sum of cardinalities].
+        joint: distribution of a variable or mutex group.
         different: factors that are not 0, int64 [F].
-        words: units touched, uint64 [W].
-        variables: the same, int64 [U].
-        values: their present values, int64 [U].
-        mutex_members: those of them that are in couplings, one coupling after the other, int64 [U].
-        per_mutex: how many are in each, int64 [Q].
-        opened: what is uncertain: a unit and -1, or where a coupling's units begin and how many they are, int64 [U + Q, 2].
+        words: affected variables as bits, uint64 [W].
+        variables: affected variables, int64 [U].
+        values: their current values, int64 [U].
+        mutex_members: those of them that are in mutex groups, one group after the other, int64 [U].
+        per_mutex: how many are in each group, int64 [Q].
+        opened: the uncertain outcomes: a variable and -1, or where a mutex group's variables begin and how many they are,
+            int64 [U + Q, 2].
         p: particles.
-        base: the next state but for what is uncertain, int64 [F].
-        following: the next state that a particle stands for, int64 [F].
+        base: the next state except for uncertain outcomes, int64 [F].
+        following: the next state that a particle represents, int64 [F].
     """
 
     on: Bools
@@ -89,7 +90,7 @@ class GraphWork(NamedTuple):
 @implements(work_for, AffectedIndex)
 @compiled
 def graph_work(g: AffectedIndex, n_grid: int) -> GraphWork:
-    """See compiled_model."""
+    """See ``overloads.work_for``."""
     n_variables, n_factors, n_mutexes = len(g.variables), len(g.row) - 1, len(g.exactly)
     width = n_variables + n_mutexes
     return GraphWork(
@@ -114,20 +115,20 @@ def graph_work(g: AffectedIndex, n_grid: int) -> GraphWork:
 def graph_outcomes(
     g: AffectedIndex, work: GraphWork, state: Ints, n_grid: int, key: np.uint64, offset: float, out: Outcomes
 ) -> int:
-    """See compiled_model."""
+    """See ``overloads.outcomes``."""
     grid, total = (n_grid, key, offset), 0
     cells, adjacencies, usual = g.cells, g.adjacencies, g.usual_on
     shown, features, on = g.shown, g.features, work.on
     variables, members, entries = g.variables, g.members, g.entries
     entry, node, leaf = g.entry, g.node, g.leaf
-    smoothing, base_rates, still, noise = g.smoothing, g.base, g.still, g.noise[0]
+    stay, unseen, still, noise = g.smoothing, g.base, g.still, g.noise[0]
     exactly, row, touched = g.exactly, g.row, g.touched
     by_adjacency, always, rates = g.by_adjacency, g.always, work.rates
     joint, different, words = work.joint, work.different, work.words
-    listed, values, mutex_members = work.variables, work.values, work.mutex_members
+    listed, now, mutex_members = work.variables, work.values, work.mutex_members
     per_mutex, opened, base = work.per_mutex, work.opened, work.base
     p, encoding = work.p, g.encoding
-    counts, observed, weights, late_end = g.counts, g.observed, g.weights, len(g.end_first) > 0
+    counts, observed, weights, ends = g.counts, g.observed, g.weights, len(g.end_first) > 0
     n_actions, first_adjacency = len(always), len(features) + encoding.n_features
     place = place_of(state)
     n_different = show_state(state, shown, features, different, on)
@@ -138,46 +139,18 @@ def graph_outcomes(
             action, state, different[:n_different], row, touched, by_adjacency, always, first_adjacency, on, usual, words, listed
         )
         _show_action(encoding, action, len(features), True, on)
-        action_class = encoding.action_class[action]
+        kind = encoding.action_class[action]
         rates_of(
-            listed[:n],
-            state,
-            action_class,
-            on,
-            variables,
-            members,
-            entries,
-            entry,
-            node,
-            leaf,
-            smoothing,
-            base_rates,
-            still,
-            noise,
-            values,
-            rates,
+            listed[:n], state, kind, on, variables, members, entries, entry, node, leaf, stay, unseen, still, noise, now, rates
         )
         for f in range(len(state)):
             base[f] = state[f]
-        begin(p, n_grid, _fits(listed[:n], variables, rates, per_mutex, late_end, n_grid), place)
+        begin(p, n_grid, _fits(listed[:n], variables, rates, per_mutex, ends, n_grid), place)
         n_open, ended = _settle(
-            listed[:n],
-            variables,
-            members,
-            exactly,
-            values,
-            rates,
-            joint,
-            mutex_members,
-            per_mutex,
-            opened,
-            p,
-            base,
-            late_end,
-            grid,
+            listed[:n], variables, members, exactly, now, rates, joint, mutex_members, per_mutex, opened, p, base, ends, grid
         )
-        if late_end:
-            _end(g, work, action_class, n_open, grid)
+        if ends:
+            _end(g, work, kind, n_open, grid)
             n_open += 1
         _show_action(encoding, action, len(features), False, on)
         n_live = _write(total, n_open, ended, base, opened, mutex_members, variables, members, p, n_grid, out)
@@ -195,7 +168,7 @@ def graph_outcomes(
 
 @compiled
 def _end(g: AffectedIndex, work: GraphWork, action_class: int, n_open: int, grid: Grid) -> None:
-    """Draws whether the episode ends, for each particle given what it became so far."""
+    """Draws whether the episode ends, for each particle given its next state so far."""
     p, joint, following, opened, end = work.p, work.joint, work.following, work.opened, len(g.variables) - 2
     n_main, n_strata = p.state[MAIN], p.state[STRATA]
     for j in range(n_main + n_strata):
@@ -220,19 +193,19 @@ def _end(g: AffectedIndex, work: GraphWork, action_class: int, n_open: int, grid
 
 @inlined
 def _show_action(encoding: ActionEncoding, action: int, first: int, shown: bool, on: Bools) -> None:
-    """Switches an action's columns, which begin at ``first``, on or off."""
+    """Switches an action's features, which begin at ``first``, on or off."""
     for i in range(encoding.first[action], encoding.first[action + 1]):
         on[first + encoding.feature[i]] = shown
 
 
 @compiled
 def _fits(touched: Ints, variables: Ints, rates: Floats, per_mutex: Ints, end_is_synchronic: bool, n_grid: int) -> bool:
-    """Whether all outcomes of a row can be listed; ``per_mutex`` is all 0, and is so again afterwards."""
+    """Whether all outcomes of a row can be listed; ``per_mutex`` is all 0 before and after the call."""
     possible = 1
     for variable in touched:
         mutex = variables[variable, MUTEX]
         if mutex >= 0:
-            rate = rates[variables[variable, START] + 1]  # as ``couplings.n_choices``
+            rate = rates[variables[variable, START] + 1]  # as ``mutex.n_choices``
             per_mutex[mutex] += int(rate > 0.0) + (_SURE if rate >= 1.0 else 0)
         elif not (end_is_synchronic and variable == len(variables) - 2):
             possible = min(possible * n_possible(rates, variables[variable, START], variables[variable, OUTPUTS]), n_grid + 1)
@@ -262,7 +235,7 @@ def _settle(
     end_is_synchronic: bool,
     grid: Grid,
 ) -> tuple[int, bool]:
-    """Writes what is sure to ``base`` and shares the particles over the rest; returns (open ones, whether it ends)."""
+    """Writes certain outcomes to ``base`` and divides the particles over the others; returns (number of others, episode end)."""
     n_variables, n_open, ended = len(variables), 0, False
     for i in range(len(touched)):
         variable = touched[i]
@@ -305,7 +278,7 @@ def _settle_mutexes(
     n_open: int,
     grid: Grid,
 ) -> int:
-    """The same for couplings."""
+    """As ``_settle``, for mutex groups; returns the number of uncertain outcomes."""
     n_variables, first = len(variables), 0
     for q in range(len(exactly)):
         n = per_mutex[q]
@@ -337,7 +310,7 @@ def _write(
     n_grid: int,
     out: Outcomes,
 ) -> int:
-    """Writes the outcomes that the particles stand for from number ``total`` on; returns their number."""
+    """Writes the outcomes that the particles represent, from number ``total`` on; returns their number."""
     states, terminated, probabilities, factors = out.states, out.terminated, out.probabilities, p.factors
     weigh(p, n_grid)
     for i in range(n_outcomes(p)):
@@ -354,7 +327,7 @@ def _write(
 def _fill(
     state: Ints, base: Ints, opened: Ints, n_open: int, mutex_members: Ints, variables: Ints, members: Ints, chosen: Ints
 ) -> int:
-    """Writes the next state [F] that a particle stands for; returns which of the open ones is the end, or -1."""
+    """Writes the next state [F] that a particle represents; returns the index of ``terminated`` in ``opened``, or -1."""
     end, n_variables = -1, len(variables)
     for f in range(len(base)):
         state[f] = base[f]
@@ -375,7 +348,7 @@ def _mutex_distribution(
 ) -> int:
     """Lists a mutex group's affected variables from ``mutex_members[first]`` on; returns the only possible one, or -1.
 
-    As ``mutexes.mutex_distribution``; the last chance is that of none.
+    As ``mutex.mutex_distribution``; the last probability is that of no bit being on.
     """
     n, total = 0, 0.0
     for variable in touched:
@@ -394,14 +367,14 @@ def _mutex_distribution(
 
 @inlined
 def _choose(state: Ints, mutex_members: Ints, first: int, n: int, chosen: int, variables: Ints, members: Ints) -> None:
-    """Switches one of a coupling's listed bits on and the others off."""
+    """Switches one of a mutex group's listed bits on and the others off."""
     for k in range(n):
         state[members[variables[mutex_members[first + k], FIRST]]] = 1 if k == chosen else 0
 
 
 @inlined
 def _put(state: Ints, variable: int, value: int, variables: Ints, members: Ints) -> None:
-    """Gives a unit its value."""
+    """Sets a variable's value."""
     first, n = variables[variable, FIRST], variables[variable, MEMBERS]
     if n == 1:
         state[members[first]] = value

@@ -2,8 +2,8 @@
 
 A *variable* is a factor, or a group of bits of which exactly one is on; ``terminated`` is one more, and so is whether a rare
 reset happens. A *feature* is on or off: a bit, one value of a factor with more than two, whether a factor has at least some
-value, or an action. A joint action of several parts (a MultiBinary or MultiDiscrete space) is one of very many, each taken a few
-times only; as features of its parts, all actions that agree in the relevant parts share what is learned.
+value, or an action. Joint actions of several components (``MultiBinary`` or ``MultiDiscrete`` spaces) are very many, and each is
+taken only a few times; with features for the components, all actions that agree in the relevant components share parameters.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from mbagent_envs.random_keys import derive, hash_rows
 
 
 class ActionEncoding(NamedTuple):
-    """Which columns each of A actions has on, and which actions are told apart from the start.
+    """The features of each of A actions, and their action classes.
 
     Attributes:
-        first: where each action's columns begin in ``feature``, int64 [A + 1].
-        feature: numbers of the columns that are on, ascending, int64.
-        n_features: number of columns K.
-        action_class: the number under which each action is counted, int64 [A]: its own where it is one thing; 0 for all where
-            actions have parts, so that only columns tell them apart.
-        n_action_classes: how many such numbers there are.
+        first: where each action's features begin in ``feature``, int64 [A + 1].
+        feature: numbers of the features that are on, ascending, int64.
+        n_features: number of features K.
+        action_class: class in which each action is counted, int64 [A]: one of its own if actions have no components; 0 for all
+            actions with components, so that only features distinguish them.
+        n_action_classes: number of action classes W.
     """
 
     first: Ints
@@ -43,62 +43,63 @@ class ActionEncoding(NamedTuple):
 
 
 def action_encoding(parts: Sequence[int]) -> ActionEncoding:
-    """Actions with so many values of each part, numbered as ``numpy.ravel_multi_index`` does.
+    """The encoding of all joint actions, numbered as by ``numpy.ravel_multi_index``.
 
     Args:
-        parts: number of values of each part; one part for actions that are one thing. A part of two values has one column,
-            others have one for each value.
+        parts: number of values of each action component; a single number for actions without components. A component of two
+            values has one feature, others have one for each value.
     """
     n_actions = math.prod(parts)
-    every = np.arange(n_actions, dtype=np.int64)
+    actions = np.arange(n_actions, dtype=np.int64)
     if len(parts) == 1:
-        return ActionEncoding(np.arange(n_actions + 1, dtype=np.int64), every, n_actions, every, n_actions)
+        return ActionEncoding(np.arange(n_actions + 1, dtype=np.int64), actions, n_actions, actions, n_actions)
     stride, n, value = np.asarray(action_features(parts), dtype=np.int64).reshape(-1, 3).T
-    action, feature = np.nonzero(every[:, None] // stride % n == value)
+    action, feature = np.nonzero(actions[:, None] // stride % n == value)
     first = np.searchsorted(action, np.arange(n_actions + 1)).astype(np.int64)
     return ActionEncoding(first, feature.astype(np.int64), len(value), np.zeros(n_actions, dtype=np.int64), 1)
 
 
 def action_features(parts: Sequence[int]) -> list[tuple[int, int, int]]:
-    """The columns as (stride, n, value): on for the actions of which ``action // stride % n`` is the value."""
-    alone = len(parts) == 1
+    """Features of actions as (stride, n, value): on for actions with ``action // stride % n == value``."""
+    single = len(parts) == 1
     return [
-        (math.prod(parts[i + 1 :]), n, value) for i, n in enumerate(parts) for value in (range(n) if n != 2 or alone else (1,))
+        (math.prod(parts[i + 1 :]), n, value) for i, n in enumerate(parts) for value in (range(n) if n != 2 or single else (1,))
     ]
 
 
 def action_feature_table(encoding: ActionEncoding, actions: Ints) -> NDArray[np.bool_]:
-    """Which columns are on under actions [B], bool [B, K]."""
+    """Features of actions [B], bool [B, K]."""
     table = np.zeros((len(encoding.action_class), encoding.n_features), dtype=np.bool_)
     table[np.repeat(np.arange(len(encoding.action_class)), np.diff(encoding.first)), encoding.feature] = True
     return table[actions]
 
 
 BEYOND = -1
-"""Stands for a channel where a meeting is with the border."""
+"""Channel number of the border in adjacency features."""
 
 
 class Layout(NamedTuple):
-    """Where units and columns lie in a state; for compiled kernels, too.
+    """Variables and features of a state, as arrays that compiled kernels can read, too.
 
     Attributes:
-        outputs: number of values of each unit, int64 [U]; the last two units are ``terminated`` and the event.
-        first: where each unit's factors begin in ``members``, int64 [U + 1].
-        members: factors of each unit; several for a group, one for a factor, none for the last two.
-        factor, value, top: what each state column stands for, int64 [D']: that a factor's value lies from ``value`` to ``top``.
+        outputs: number of values of each variable, int64 [U]; the last two variables are ``terminated`` and the reset.
+        first: where each variable's factors begin in ``members``, int64 [U + 1].
+        members: factors of each variable; several for a group, one for a factor, none for the last two.
+        factor, value, top: the state features, int64 [D']: on if the factor's value is at least ``value`` and at most ``top``.
         n_factors: number of factors F.
-        encoding: which columns actions have on, K in all, and which are told apart from the start.
-        cells: where the observation is a stack of planes, the factor of each channel in each row and column, int64 [C, H, W];
+        encoding: the K features of actions, and the action classes.
+        cells: if the observation is a stack of planes, the factor of each channel in each row and column, int64 [C, H, W];
             else empty.
-        adjacencies: columns that are on where, anywhere on the planes, a channel has a value and so has another (or the same) so
-            many rows below and columns to the right: (channel, value, channel, value, rows, columns), int64 [M, 6].
-            D = D' + K + M columns in all.
-        mutex_first: where each coupling's units begin in ``mutex_members``, int64 [Q + 1].
-        mutex_members: units, all bits, of which at most one is on after a step.
-        exactly: whether it is exactly one, bool [Q].
-        mutex_of: coupling that each unit is in, or -1, int64 [U].
-        counts, observed: what planes keep to, see ``invariants.py``.
-        weights: what each channel's value counts in the number of a combination, int64 [C].
+        adjacencies: adjacency features, on if anywhere on the planes a channel has a value and a channel (another or the same)
+            has a value at a fixed offset: (channel, value, channel, value, rows below, columns to the right), int64 [M, 6].
+            D = D' + K + M features in all.
+        next_adjacencies: adjacency features of the next state, int64 [M', 6].
+        mutex_first: where each mutex group's variables begin in ``mutex_members``, int64 [Q + 1].
+        mutex_members: variables, all bits, of which at most one is on after a step.
+        exactly: whether exactly one is on, bool [Q].
+        mutex_of: mutex group of each variable, or -1, int64 [U].
+        counts, observed: invariants of planes, see ``invariants.py``.
+        weights: weight of each channel's value in the number of a combination of values, int64 [C].
     """
 
     outputs: Ints
@@ -122,19 +123,19 @@ class Layout(NamedTuple):
 
 
 MOST_STEPS = 128
-"""Columns "at least so much" of one factor; of more values, evenly spaced ones have one."""
+"""Maximum number of threshold features of one factor; with more values, the thresholds are evenly spaced."""
 
 
 def make_layout(
     cardinalities: Sequence[int], groups: Sequence[Sequence[int]], encoding: ActionEncoding, ordinal: bool = True
 ) -> Layout:
-    """Units of factors: the groups first, then all other factors in their order, then ``terminated`` and the event.
+    """The layout whose variables are the groups, then all other factors in their order, then ``terminated`` and the reset.
 
     Args:
         cardinalities: number of values of each factor.
         groups: factors of each group.
         encoding: the actions.
-        ordinal: whether there are columns for a factor having at least some value.
+        ordinal: whether factors have threshold features (at least a value).
     """
     grouped = {f for group in groups for f in group}
     members = [*(list(group) for group in groups), *([f] for f in range(len(cardinalities)) if f not in grouped), [], []]
@@ -173,7 +174,7 @@ def _features_of(factor: int, cardinality: int, ordinal: bool) -> list[tuple[int
 
 
 def shown(layout: Layout, states: Factors, features: Ints | None = None) -> Bools:
-    """Which state columns are on in states [B, F], bool [B, D'], or [B, K] of those ``features`` [K]."""
+    """State features of states [B, F], bool [B, D'], or only the given ``features`` [K], bool [B, K]."""
     which = np.arange(len(layout.factor)) if features is None else features
     values = states[:, layout.factor[which]]
     result: Bools = (values >= layout.value[which]) & (values <= layout.top[which])
@@ -181,7 +182,7 @@ def shown(layout: Layout, states: Factors, features: Ints | None = None) -> Bool
 
 
 def layout_with_mutexes(layout: Layout, mutexes: Sequence[Ints], exactly: Sequence[bool] | None = None) -> Layout:
-    """The layout with couplings, each given by its units; exactly one bit of a coupling is on, or at most one (default)."""
+    """The layout with mutex groups, each given by its variables; exactly one bit of a group is on, or at most one (default)."""
     of = np.full(len(layout.outputs), -1, dtype=np.int64)
     for number, variables in enumerate(mutexes):
         of[variables] = number
@@ -194,13 +195,16 @@ def layout_with_mutexes(layout: Layout, mutexes: Sequence[Ints], exactly: Sequen
 
 
 def is_lone_bit(layout: Layout) -> Bools:
-    """Which units are a single bit, bool [U]."""
+    """Which variables are a single bit, bool [U]."""
     result: Bools = (layout.outputs == 2) & (np.diff(layout.first) == 1)
     return result
 
 
 def variable_values(layout: Layout, states: Factors) -> Factors:
-    """Value of each unit of factors, [B, U - 2], in states [B, F], as narrow as can be; in a group the first bit on counts."""
+    """Value of each variable but the last two in states [B, F], [B, U - 2], in the smallest dtype.
+
+    A group's value is the number of its first bit that is on.
+    """
     values = np.empty((len(states), len(layout.outputs) - 2), dtype=np.min_scalar_type(int(layout.outputs.max()) - 1))
     for variable in range(values.shape[1]):
         members = layout.members[layout.first[variable] : layout.first[variable + 1]]
@@ -209,7 +213,7 @@ def variable_values(layout: Layout, states: Factors) -> Factors:
 
 
 def feature_table(layout: Layout, states: Factors, actions: Ints) -> Bools:
-    """Which columns are on, bool [B, D]: those of states [B, F], then those of actions [B]."""
+    """Features of states [B, F], then those of actions [B], bool [B, D]."""
     return np.concatenate(
         [shown(layout, states), action_feature_table(layout.encoding, actions)],
         axis=1,
@@ -217,13 +221,13 @@ def feature_table(layout: Layout, states: Factors, actions: Ints) -> Bools:
 
 
 def feature_kinds(layout: Layout, states: Factors, changing: Bools) -> Ints:
-    """Which kind of thing each column is, int64 [D], by what can be seen without knowing the world.
+    """Kind of each feature, int64 [D]; the search uses a common prior for all features of a kind.
 
-    The values of one unit are one kind; so are all bits that change, and all actions; bits that stay fall in two kinds by
-    how often they are on, where the largest gap is.
+    The values of one variable are one kind, its threshold features another one. All bits that change are one kind, as are all
+    actions. Constant bits are divided into two kinds by how often they are on, at the largest gap.
 
     Args:
-        layout: the units.
+        layout: the variables.
         states: int64 [N, F].
         changing: which factors change, bool [F].
     """
@@ -236,29 +240,30 @@ def feature_kinds(layout: Layout, states: Factors, changing: Bools) -> Ints:
     owner = of_factor[layout.factor]
     steps = np.where(layout.top > layout.value, len(layout.outputs), 0)
     kinds[:n_features][owner >= 0] = (4 + owner + steps)[owner >= 0]
-    still = np.flatnonzero((owner < 0) & ~changing[layout.factor])
-    if len(still) == 0:
+    constant = np.flatnonzero((owner < 0) & ~changing[layout.factor])
+    if len(constant) == 0:
         return kinds
-    often = np.log(states[:, layout.factor[still]].mean(axis=0) + 1e-3)
-    order, edge = np.argsort(often, kind="stable"), len(still) // 6
-    gaps = np.diff(often[order])[edge : len(still) - 1 - edge]
-    cut = edge + int(gaps.argmax()) + 1 if len(gaps) else len(still)
-    kinds[still[order[:cut]]] = 2
-    kinds[still[order[cut:]]] = 3
+    frequency = np.log(states[:, layout.factor[constant]].mean(axis=0) + 1e-3)
+    order, edge = np.argsort(frequency, kind="stable"), len(constant) // 6
+    gaps = np.diff(frequency[order])[edge : len(constant) - 1 - edge]
+    cut = edge + int(gaps.argmax()) + 1 if len(gaps) else len(constant)
+    kinds[constant[order[:cut]]] = 2
+    kinds[constant[order[cut:]]] = 3
     return kinds
 
 
 @dataclass(frozen=True)
 class Question:
-    """Whether a unit takes a value, or moves so far, in the contexts (action, present value) in which that is possible.
+    """Whether a variable takes a value, or changes by an amount, in the (action, current value) pairs where that is possible.
 
     Attributes:
-        variable: number of the unit.
-        values: the value after each pair, int64 [P].
-        pairs: action times cardinality plus present value, of each pair that has an answer, int64 [P], ascending.
+        variable: number of the variable.
+        values: the predicted next value for each pair, int64 [P].
+        pairs: action class times cardinality plus current value of each pair, int64 [P], ascending.
         target: the rows.
-        context: the context of each pair, int64 [P]; unless several pairs are one context from the start, each is its own.
-        operand: columns of what takes the action's place in the pairs, one for each of its values, int64; None for the action.
+        context: initial context of each pair, int64 [P]: one of its own, unless several pairs share a context.
+        operand: features of the operand that replaces the action in the pairs, one for each of its values, int64; None for the
+            action.
     """
 
     variable: int
@@ -271,13 +276,13 @@ class Question:
 
 @dataclass(frozen=True)
 class Observed:
-    """Rows and what they look like.
+    """Transitions of one variable, with the patterns of their features.
 
     Attributes:
-        pattern: number of each row's look, action included, int64 [N]; rows of one look have one present value.
-        actions: the ways of the actions, see ``ActionEncoding``, int64 [N].
-        now: a unit's present values, int64 [N].
-        then: those that follow, int64 [N].
+        pattern: number of each row's pattern, including the action, int64 [N]; rows of one pattern have one current value.
+        actions: action classes, see ``ActionEncoding``, int64 [N].
+        now: the variable's current values, int64 [N].
+        then: its next values, int64 [N].
     """
 
     pattern: Ints
@@ -291,24 +296,24 @@ class Observed:
 
 
 def ask(variable: int, cardinality: int, observed: Observed) -> list[Question]:
-    """The questions about one unit, where it goes; none if it never changes.
+    """The one-vs-rest questions about a variable's next value; none if it never changes.
 
     Args:
         variable: its number.
         cardinality: number of its values.
-        observed: the rows to ask.
+        observed: its transitions.
     """
     if (observed.now == observed.then).all():
         return []
     if cardinality == 2:
         return [question(variable, observed.then, 1, cardinality, observed)]
-    pair, asked = observed.actions * cardinality + observed.now, []
+    pair, questions = observed.actions * cardinality + observed.now, []
     for value in np.unique(observed.then[observed.now != observed.then]):
-        leading = np.unique(pair[observed.then == value])
-        leading = leading[leading % cardinality != value]
-        some = observed.select(np.flatnonzero(np.isin(pair, leading)))
-        asked.append(question(variable, some.then, int(value), cardinality, some))
-    return asked
+        sources = np.unique(pair[observed.then == value])
+        sources = sources[sources % cardinality != value]
+        some = observed.select(np.flatnonzero(np.isin(pair, sources)))
+        questions.append(question(variable, some.then, int(value), cardinality, some))
+    return questions
 
 
 def question(
@@ -320,16 +325,16 @@ def question(
     every: Ints | None = None,
     alike: Ints | None = None,
 ) -> Question:
-    """Whether ``positives`` [R] is some value; in the pairs met, or in ``every`` one of these.
+    """The question whether ``positives`` [R] equals a value, for the observed pairs or for the given ones.
 
     Args:
-        variable: its number.
-        positives: what came in each row, int64 [R].
-        value: what is asked for.
-        cardinality: number of the unit's values.
+        variable: number of the variable.
+        positives: outcome of each row, int64 [R].
+        value: the outcome that counts as positive.
+        cardinality: number of the variable's values.
         observed: the R rows.
-        every: pairs that get an answer, int64 [P], ascending; None for those met.
-        alike: number of the context of each, int64 [P]; None for one each.
+        every: pairs to predict for, int64 [P], ascending; None for the observed ones.
+        alike: number of the initial context of each pair, int64 [P]; None for one context each.
     """
     n, e = np.bincount(observed.pattern), np.bincount(observed.pattern, weights=positives == value).astype(np.int64)
     pair_of = np.empty(len(n), dtype=np.int64)
@@ -337,12 +342,12 @@ def question(
     rows = np.flatnonzero(n)
     pairs = np.unique(pair_of[rows]) if every is None else every
     context = np.arange(len(pairs)) if alike is None else np.unique(alike, return_inverse=True)[1].astype(np.int64)
-    asked, several = np.searchsorted(pairs, pair_of[rows]), np.full(context.max(initial=-1) + 1, -1)
+    position, several = np.searchsorted(pairs, pair_of[rows]), np.full(context.max(initial=-1) + 1, -1)
     target = Target(
         rows,
         n[rows],
         e[rows],
-        context[asked],
+        context[position],
         pairs // cardinality if alike is None else several,
         pairs % cardinality if alike is None else several,
     )
@@ -350,11 +355,11 @@ def question(
 
 
 ENTRIES_AT_ONCE = 20_000_000
-"""Entries of a table whose rows are told apart at once."""
+"""Entries of a table that are hashed at once."""
 
 
 def distinct(table: NDArray[Any], also: Ints | None = None) -> tuple[Ints, Ints]:
-    """Numbers of rows that look different [P], and which of them each row [N] looks like, int64 [N].
+    """Number of the first row of each pattern [P], and the pattern of each row, int64 [N].
 
     Args:
         table: integers or booleans [N, D].
@@ -362,8 +367,8 @@ def distinct(table: NDArray[Any], also: Ints | None = None) -> tuple[Ints, Ints]
     """
     step = max(1, ENTRIES_AT_ONCE // max(table.shape[1], 1))
     parts = [hash_rows(table[begin : begin + step]) for begin in range(0, len(table), step)]
-    tags = np.concatenate([np.zeros(0, dtype=np.uint64), *parts])
+    hashes = np.concatenate([np.zeros(0, dtype=np.uint64), *parts])
     if also is not None:
-        tags = derive(tags, also.astype(np.uint64))
-    _, first, pattern = np.unique(tags, return_index=True, return_inverse=True)
+        hashes = derive(hashes, also.astype(np.uint64))
+    _, first, pattern = np.unique(hashes, return_index=True, return_inverse=True)
     return first, pattern.astype(np.int64)

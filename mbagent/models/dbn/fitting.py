@@ -1,8 +1,8 @@
 """Fitting decision graphs to transitions: variables, resets, targets, splits, and synchronic arcs.
 
 A variable may depend on the next values of others (synchronic arcs, the paper's conditioner of section 3.2). Only variables whose
-errors are correlated with those of an earlier one get such arcs, and, as with a causal mask, variable i sees y_<i alone, so that
-probabilities stay exact. Whether the episode ends comes last: it mostly depends on the next state.
+errors are correlated with those of an earlier one get such arcs, and, as with a causal mask, variable i depends only on y_<i, so
+that probabilities stay exact. Termination comes last, since it mostly depends on the next state.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from mbagent.models.systematic_sampling import NEGLIGIBLE
 from mbagent.types import Bools, Floats, Ints
 
 USUAL = 0.95
-"""Share of transitions that are taken for usual in any case."""
+"""Share of transitions that always count as usual."""
 
 
 def flag_resets(states: Factors, next_states: Factors) -> Bools:
-    """Which transitions look like a rare event, bool [N].
+    """Which transitions are candidates for resets, bool [N].
 
-    Those that change more than twice as many factors as nearly all others, and those that change factors which otherwise
-    never change.
+    These are the transitions that change factors which never change in the usual ones: transitions that change at most twice as
+    many factors as the quantile ``USUAL``.
 
     Args:
         states: int [N, F].
@@ -57,40 +57,40 @@ def flag_resets(states: Factors, next_states: Factors) -> Bools:
     changed = states != next_states
     count = changed.sum(axis=1)
     usual = count <= 2 * max(1.0, float(np.quantile(count, USUAL))) if len(count) else np.ones(0, dtype=np.bool_)
-    still = ~changed[usual].any(axis=0)
-    resets: Bools = changed[:, still].any(axis=1)
+    constant = ~changed[usual].any(axis=0)
+    resets: Bools = changed[:, constant].any(axis=1)
     return resets
 
 
 UNCERTAIN = 2.0
-"""Variance summed over all rows from which a column counts as uncertain."""
+"""Variance summed over all rows from which a feature counts as uncertain."""
 
 MANY = 8.0
-"""Products of two columns' variances summed over all rows from which the sum of their errors' products is about normal."""
+"""Sum of the products of two features' variances from which the sum of the products of their errors is about normal."""
 
 APART = 6.0
-"""Standard errors that two columns' errors must go together by, beyond what the largest of so many reaches by chance."""
+"""Standard errors by which two features' errors must be correlated, beyond the expected maximum of all pairs by chance."""
 
 MOST_ERRORS = 4_000_000
-"""Entries of the table of errors; of more rows, evenly chosen ones are looked at."""
+"""Maximum number of entries of the table of errors; of more rows, an evenly spaced subset is used."""
 
 
 ROWS_AT_ONCE = 2000
-"""Rows that are handed to the compiled kernels at once, which read wide integers."""
+"""Rows that are converted to wide integers at once, for the compiled kernels."""
 
 
 def uncertain_rows(rows: TransitionBatch, layout: Layout, graphs: Graphs, variables: Ints) -> Bools:
-    """In which rows some units need their late graphs, bool [N, len(units)]."""
+    """In which rows the given variables need their synchronic graphs, bool [N, len(variables)]."""
     found = [sampling.uncertain(part.states, part.actions, layout, graphs, variables) for part in rows.parts(ROWS_AT_ONCE)]
     return np.concatenate([np.zeros((0, len(variables)), dtype=np.bool_), *found])
 
 
 class Asked(NamedTuple):
-    """What a unit is asked again with.
+    """A variable with synchronic arcs, and the features of the next state that it may depend on.
 
     Attributes:
         variable: its number.
-        features: columns of the next state, numbered as those of the state.
+        features: features of the next state, numbered as those of the current state.
     """
 
     variable: int
@@ -98,7 +98,7 @@ class Asked(NamedTuple):
 
 
 def probabilities(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Floats:
-    """Probability of each state column after each row, each for itself, [N, D']."""
+    """Marginal probability of each feature of the next state for each row, [N, D']."""
     sizes = np.full(layout.n_factors, 2, dtype=np.int64)
     np.maximum.at(sizes, layout.factor, layout.top + 1)
     start = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
@@ -110,16 +110,16 @@ def probabilities(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Floa
 
 
 def go_together(error: Floats, other: Floats, spread: Floats, other_spread: Floats, n_tried: int) -> bool:
-    """Whether two columns' errors [...] go together, given their variances [...], one of ``n_tried`` such questions."""
+    """Whether two features' errors [...] are correlated, given their variances [...], in one of ``n_tried`` tests."""
     one, two, three, four = (part.reshape(-1, 1) for part in (error, other, spread, other_spread))
-    return bool(_telling(one, two, three, four, n_tried)[0, 0])
+    return bool(_correlated(one, two, three, four, n_tried)[0, 0])
 
 
-def _telling(error: Floats, other: Floats, spread: Floats, other_spread: Floats, n_tried: int) -> Bools:
-    """Which columns' errors go together, bool [D, E], from errors and variances [N, D] and [N, E].
+def _correlated(error: Floats, other: Floats, spread: Floats, other_spread: Floats, n_tried: int) -> Bools:
+    """Which features' errors are correlated, bool [D, E], from errors and variances [N, D] and [N, E].
 
-    Of many by the sum of products of errors; of rare values by how often both came unexpectedly in the same row, which by
-    chance has a Poisson distribution.
+    The test statistic is the sum of the products of errors; for rare values, it is the number of rows in which both had their
+    less probable value, which is Poisson distributed if they are independent.
     """
     limit = APART + np.sqrt(2.0 * np.log(max(n_tried, 2)))
     products, variances = error.T @ other, spread.T @ other_spread
@@ -127,31 +127,31 @@ def _telling(error: Floats, other: Floats, spread: Floats, other_spread: Floats,
     few = variances <= MANY
     if few.any():
         both = _unexpected(error).T @ _unexpected(other)
-        expected = _least(spread).T @ _least(other_spread)
+        expected = _minority(spread).T @ _minority(other_spread)
         result |= few & (both > 0.0) & (gammainc(np.maximum(both, 1.0), expected) < ndtr(-limit))  # P(Poisson >= both)
     return result
 
 
 def _unexpected(error: Floats) -> Floats:
-    """1 where what came was the less probable, else 0."""
+    """1 where the less probable value was observed, else 0."""
     result: Floats = (np.abs(error) > 0.5).astype(np.float64)
     return result
 
 
-def _least(spread: Floats) -> Floats:
-    """Probability of the less probable of two values, of the variance."""
+def _minority(spread: Floats) -> Floats:
+    """Probability of the less probable of two values, from the variance."""
     result: Floats = 0.5 - np.sqrt(np.maximum(0.25 - spread, 0.0))
     return result
 
 
 def find_dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, usual: Ints) -> list[Asked]:
-    """Units to be asked again, in order, with what; ``terminated`` last, with all that changes.
+    """Variables that may need synchronic arcs, in their order; ``terminated`` last, with the features of all changing variables.
 
     Args:
-        layout: the units, with their couplings.
-        graphs: of each for itself.
+        layout: the variables, with their mutex groups.
+        graphs: without synchronic arcs.
         rows: N transitions.
-        usual: those that are no rare events, int64 [R].
+        usual: numbers of those that are no resets, int64 [R].
     """
     n_features, last = len(layout.factor), len(layout.outputs) - 2
     variable_of = np.empty(layout.n_factors, dtype=np.int64)
@@ -166,46 +166,46 @@ def find_dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, usual:
 
 
 def _dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, owner: Ints) -> Mapping[int, Ints]:
-    """Columns of earlier units whose errors go with those of a unit, by unit in ascending order."""
+    """Features of earlier variables whose errors are correlated with those of a variable, by variable in ascending order."""
     if len(rows) == 0 or len(owner) == 0:
         return {}
     probs = probabilities(layout, graphs, rows)
     spread = probs * (1.0 - probs)
     uncertain = np.flatnonzero(spread.sum(axis=0) > UNCERTAIN)
     error = shown(layout, rows.after, uncertain) - probs[:, uncertain]
-    telling = np.zeros((len(uncertain), len(uncertain)), dtype=np.bool_)
-    for action in np.unique(rows.actions):  # what goes together under one action may go apart under another
+    correlated = np.zeros((len(uncertain), len(uncertain)), dtype=np.bool_)
+    for action in np.unique(rows.actions):  # correlations may have opposite signs under different actions
         e, v = error[rows.actions == action], spread[rows.actions == action][:, uncertain]
-        telling |= _telling(e, e, v, v, len(uncertain))
+        correlated |= _correlated(e, e, v, v, len(uncertain))
     variable, mutex = owner[uncertain], layout.mutex_of[owner[uncertain]]
     earlier = variable[:, None] < variable
     together = (mutex[:, None] == mutex) & (mutex >= 0)
-    goes = earlier & ~together & (mutex < 0) & telling
+    arcs = earlier & ~together & (mutex < 0) & correlated
     return {
-        int(u): uncertain[goes[:, variable == u].any(axis=1)]
-        for u in np.unique(variable[goes.any(axis=0)])
-        if goes[:, variable == u].any()
+        int(u): uncertain[arcs[:, variable == u].any(axis=1)]
+        for u in np.unique(variable[arcs.any(axis=0)])
+        if arcs[:, variable == u].any()
     }
 
 
 NO_EFFECTS: Mapping[int, EffectModel] = MappingProxyType({})
-"""All factors are asked where they go."""
+"""All factors have absolute effects."""
 
 MUTEX_ROWS = 4000
-"""Rows on which it is looked at how often bits should be on together."""
+"""Rows from which it is estimated how often bits would be on together if they were independent."""
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """What was found.
+    """Fitted graphs.
 
     Attributes:
-        layout: the units.
-        usual: graphs of all units, each for itself, and of whether the event happens.
-        synchronic: graphs of the units that are drawn after the others, given what those became, in order.
-        reset: graphs of what happens in an event; as ``usual`` where there is none.
-        has_reset: whether there is one.
-        asked, found: questions and splits behind ``usual`` and ``synchronic``.
+        layout: the variables.
+        usual: graphs of all variables without synchronic arcs, and of whether a reset happens.
+        synchronic: graphs of the variables that are drawn after the others, given those variables' next values, in order.
+        reset: graphs of the next state in a reset; as ``usual`` if there are no resets.
+        has_reset: whether there are resets.
+        asked, found: questions and finished searches of ``usual`` and ``synchronic``.
     """
 
     layout: Layout
@@ -218,20 +218,20 @@ class Fitted:
 
 
 def for_planning(fitted: Fitted) -> Fitted:
-    """The graphs as planners read them: what no observation stands behind is no outcome, all else is one, however rare."""
+    """The graphs for planning, where negligible values are possible outcomes only if they were observed."""
     noise = np.full(1, NEGLIGIBLE)
     usual, synchronic, reset = (graphs._replace(noise=noise) for graphs in (fitted.usual, fitted.synchronic, fitted.reset))
     return replace(fitted, usual=usual, synchronic=synchronic, reset=reset)
 
 
 class _Table:
-    """Transitions as units and columns.
+    """Transitions as values of variables, with a table of their features.
 
     Args:
-        layout: the units.
+        layout: the variables.
         rows: N transitions.
-        resets: which of them are rare events, bool [N].
-        effects: how factors are asked about, if not where they go.
+        resets: which of them are resets, bool [N].
+        effects: effects of factors; absolute if missing.
         since: first row that counts for each factor and for ``terminated``, int64 [F + 1]; None for all.
     """
 
@@ -256,35 +256,35 @@ class _Table:
         self.first, self.features = first, feature_table(layout, rows.before[first], rows.actions[first])
 
     def ask(self, variable: int, which: Ints) -> list[Question]:
-        """The questions about a unit, of some rows."""
+        """The questions about a variable, from some rows."""
         return self.questions(variable, self.observed(variable).select(self.counting(variable, which)))
 
     def counting(self, variable: int, which: Ints) -> Ints:
-        """Those of some rows that count for a unit."""
+        """The rows, of some, that count for a variable."""
         result: Ints = which[which >= self.since[variable]]
         return result
 
     def questions(self, variable: int, observed: Observed) -> list[Question]:
-        """The questions about a unit, of rows with whatever looks."""
+        """The questions about a variable, from rows with any patterns."""
         effect, operand = self.effects.get(variable, ABSOLUTE_EFFECT)
         n_action_classes = self.layout.encoding.n_action_classes if operand is None else operand.cardinality
-        asked = questions_for_effect(effect, variable, int(self.layout.outputs[variable]), n_action_classes, observed)
-        return asked if operand is None else [replace(one, operand=operand.features(self.layout)) for one in asked]
+        found = questions_for_effect(effect, variable, int(self.layout.outputs[variable]), n_action_classes, observed)
+        return found if operand is None else [replace(one, operand=operand.features(self.layout)) for one in found]
 
     def observed(self, variable: int) -> Observed:
-        """A unit's values in all rows, with the action or what takes its place."""
+        """A variable's values in all rows, with the action class or the operand's value."""
         now, then = (values[:, variable].astype(np.int64) for values in (self.now, self.then))
         operand = self.effects.get(variable, ABSOLUTE_EFFECT).operand
         action_classes = self.layout.encoding.action_class[self.rows.actions] if operand is None else operand.of(self.rows)
         return Observed(self.pattern, action_classes, now, then)
 
     def kinds(self, observed: Ints) -> Ints:
-        """Kind of each column, by some rows."""
+        """Kind of each feature, from some rows."""
         changing = (self.rows.before[observed] != self.rows.after[observed]).any(axis=0)
         return feature_kinds(self.layout, self.rows.before[observed], changing)
 
-    def build(self, asked: Sequence[Question], found: Sequence[Search], observed: Ints, still: float) -> Graphs:
-        """The graphs; habits are those of the rows seen."""
+    def build(self, questions: Sequence[Question], found: Sequence[Search], observed: Ints, still: float) -> Graphs:
+        """The graphs; smoothing is estimated from the observed rows."""
         smoothings, n_action_classes = [], self.layout.encoding.n_action_classes
         for variable, cardinality in enumerate(self.layout.outputs):
             some, (effect, operand) = (
@@ -295,11 +295,11 @@ class _Table:
                 effect, int(cardinality), n_action_classes if operand is None else operand.cardinality, some
             )
             smoothings.append(smoothing if operand is None else for_all_actions(smoothing, operand.cardinality, n_action_classes))
-        return build(self.layout, asked, found, smoothings, still)
+        return build(self.layout, questions, found, smoothings, still)
 
 
 def no_synchronic(graphs: Graphs) -> Graphs:
-    """Graphs of no unit, for where nothing is drawn late."""
+    """Graphs of no variable, for models without synchronic arcs."""
     return graphs._replace(changing=np.zeros(0, dtype=np.int64), feature=np.full_like(graphs.feature, -1))
 
 
@@ -313,65 +313,65 @@ def fit_graphs(
     effects: Mapping[int, EffectModel] = NO_EFFECTS,
     since: Ints | None = None,
 ) -> Fitted:
-    """Fits everything.
+    """Fits the graphs of all variables, of resets, and of synchronic arcs.
 
     Args:
         cardinalities: number of values of each factor.
         encoding: the actions.
         rows: N transitions.
-        resets: which of them are rare events, bool [N].
-        in_pairs: whether to look for causes that matter only together, which takes most of the time.
-        jointly: whether to look for units that hang on what others become.
-        effects: how factors are asked about, if not where they go.
+        resets: which of them are resets, bool [N].
+        in_pairs: whether to search for pairwise splits, which takes most of the time.
+        jointly: whether to search for synchronic arcs.
+        effects: effects of factors; absolute if missing.
         since: first row that counts for each factor and for ``terminated``, int64 [F + 1]; None for all.
     """
     groups = find_groups(cardinalities, rows.before, rows.after, ~resets)
     layout = make_layout(cardinalities, groups, encoding)
     table, usual = _Table(layout, rows, resets, effects, since), np.flatnonzero(~resets)
     last = len(layout.outputs) - 1
-    asked_of = {variable: np.arange(len(rows)) if variable == last else usual for variable in range(last + 1)}
-    graphs, asked, found = _graphs(table, asked_of, usual, True, in_pairs)
+    rows_of = {variable: np.arange(len(rows)) if variable == last else usual for variable in range(last + 1)}
+    graphs, questions, found = _graphs(table, rows_of, usual, True, in_pairs)
     layout = _with_mutexes(layout, graphs, rows)
     synchronic = no_synchronic(graphs)
     if jointly:
-        synchronic, more_asked, more_found = _synchronic_graphs(table, layout, graphs, usual, in_pairs)
-        asked, found = [*asked, *more_asked], [*found, *more_found]
+        synchronic, more_questions, more_found = _synchronic_graphs(table, layout, graphs, usual, in_pairs)
+        questions, found = [*questions, *more_questions], [*found, *more_found]
     reset = graphs
     if resets.any():
         rare = np.flatnonzero(resets)
         reset, _, _ = _graphs(table, dict.fromkeys(range(last), rare), rare, False, in_pairs)
-    return Fitted(layout, graphs, synchronic, reset, bool(resets.any()), asked, found)
+    return Fitted(layout, graphs, synchronic, reset, bool(resets.any()), questions, found)
 
 
 def _synchronic_graphs(
     table: _Table, layout: Layout, graphs: Graphs, usual: Ints, in_pairs: bool
 ) -> tuple[Graphs, list[Question], list[Search]]:
-    """Graphs of units that hang on what others become, with questions and splits."""
+    """Graphs of variables with synchronic arcs, with their questions and finished searches."""
     rows, kinds, n_features = table.rows, table.kinds(usual), table.features.shape[1]
-    synchronic, all_asked, all_found = [], [], []
+    synchronic, all_questions, all_found = [], [], []
     for variable, features in find_dependent(layout, graphs, rows, usual):
         counting = table.counting(variable, usual)
         needed = uncertain_rows(rows.select(counting), layout, graphs, np.asarray([variable]))[:, 0]
         some = table.observed(variable).select(counting[needed])
         following = shown(layout, rows.after[counting[needed]], features)
         first, pattern = distinct(following, some.pattern)
-        asked = table.questions(variable, replace(some, pattern=pattern))
+        questions = table.questions(variable, replace(some, pattern=pattern))
         more_kinds = np.concatenate([kinds, kinds.max(initial=0) + 1 + kinds[features]])
         more = np.concatenate([table.features[some.pattern[first]], following[first]], axis=1)
-        found = find_splits([q.target for q in asked], more, more_kinds, layout.encoding.n_action_classes, in_pairs)
+        found = find_splits([q.target for q in questions], more, more_kinds, layout.encoding.n_action_classes, in_pairs)
         if any(split.feature >= n_features for search in found for split in search.splits):
             numbers = np.concatenate([np.arange(n_features), n_features + features])
             synchronic.append(variable)
-            all_asked += asked
+            all_questions += questions
             all_found += [search.renamed(numbers) for search in found]
     if not synchronic:
         return no_synchronic(graphs), [], []
-    built = table.build(all_asked, all_found, usual, float(graphs.still[0]))
-    return built._replace(changing=np.asarray(synchronic, dtype=np.int64)), all_asked, all_found
+    built = table.build(all_questions, all_found, usual, float(graphs.still[0]))
+    return built._replace(changing=np.asarray(synchronic, dtype=np.int64)), all_questions, all_found
 
 
 def _with_mutexes(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Layout:
-    """The layout with those bits coupled that are never on together, though each for itself might be."""
+    """The layout with mutex groups of bits that are never on together, although they would often be if they were independent."""
     bits = graphs.changing[is_lone_bit(layout)[graphs.changing]]
     if len(bits) < 2 or len(rows) == 0:
         return layout
@@ -396,16 +396,16 @@ def _cardinalities(layout: Layout) -> NDArray[np.int64]:
 
 
 def _graphs(
-    table: _Table, asked_of: dict[int, Ints], observed: Ints, regular: bool, in_pairs: bool
+    table: _Table, rows_of: dict[int, Ints], observed: Ints, regular: bool, in_pairs: bool
 ) -> tuple[Graphs, list[Question], list[Search]]:
-    """Graphs of some units, each asked of some rows; ``observed`` are the rows of this regime.
+    """Graphs of some variables, each fitted to the given rows; ``observed`` are the rows of this regime.
 
-    In a ``regular`` regime units that never changed are all taken together for how likely they are to change; where
-    anything may change, each for itself.
+    The probability that a variable which never changed does change is estimated from all variables together in a ``regular``
+    regime, else for each by itself.
     """
-    asked = [question for variable, which in asked_of.items() for question in table.ask(variable, which)]
+    questions = [question for variable, which in rows_of.items() for question in table.ask(variable, which)]
     found = find_splits(
-        [q.target for q in asked], table.features, table.kinds(observed), table.layout.encoding.n_action_classes, in_pairs
+        [q.target for q in questions], table.features, table.kinds(observed), table.layout.encoding.n_action_classes, in_pairs
     )
     still = 0.5 / (len(observed) * (len(table.layout.outputs) if regular else 1) + 1.0)
-    return table.build(asked, found, observed, still), asked, found
+    return table.build(questions, found, observed, still), questions, found

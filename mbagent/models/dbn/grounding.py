@@ -1,4 +1,4 @@
-"""From graphs of relative columns, one for each channel, to graphs for every cell of a board of any size."""
+"""Grounding: from graphs with relative features, one set for each channel, to graphs of every cell of a board of any size."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mbagent.spaces import PlaneLayout
 from mbagent.types import Ints
 
 WHOLE, ROW, COLUMN = 0, 1, 2
-"""What cells of a channel a coupling is about."""
+"""Cells of a channel that form a mutex group: all of them, or those of a row or column."""
 
 
 class Mutex(NamedTuple):
@@ -25,8 +25,8 @@ class Mutex(NamedTuple):
     Attributes:
         channel: the channel, of bits.
         kind: WHOLE, ROW or COLUMN.
-        line: which row or column, from the top or left; counted from the other end, -1 first, where it lies nearer to that.
-        exactly: whether it is exactly one.
+        line: number of the row or column, from the top or left; if it is nearer to the other end, counted from there, -1 first.
+        exactly: whether exactly one is on.
     """
 
     channel: int
@@ -35,12 +35,12 @@ class Mutex(NamedTuple):
     exactly: bool
 
     def lies_on(self, height: int, width: int) -> bool:
-        """Whether a board has this line at all."""
+        """Whether a board has this line."""
         length = {WHOLE: 1, ROW: height, COLUMN: width}[self.kind]
         return -length <= self.line < length
 
     def cells(self) -> tuple[slice | int, slice | int]:
-        """Its rows and columns."""
+        """Indices of its rows and columns."""
         rows = self.line if self.kind == ROW else slice(None)
         cols = self.line if self.kind == COLUMN else slice(None)
         return rows, cols
@@ -48,16 +48,17 @@ class Mutex(NamedTuple):
 
 @dataclass(frozen=True)
 class LocalGraphs:
-    """What holds at every position.
+    """Graphs, mutex groups and invariants that are the same at every position.
 
     Attributes:
-        graphs: units are the channels, then ``terminated`` and the event; columns are relative.
-        synchronic: those of channels whose cells are drawn late, from the upper left on, channel after channel.
-        features: the relative columns, int64 [D, 7], see ``windows.py``.
+        graphs: variables are the channels, then ``terminated`` and the reset; features are relative.
+        synchronic: graphs of channels whose cells have synchronic arcs; cells are drawn from the upper left on, channel after
+            channel.
+        features: the relative features, int64 [D, 7], see ``plane_features.py``.
         cardinalities: number of values of each channel's cells, length C.
         encoding: the actions.
-        mutexes: bits of which at most one is on.
-        invariants: what every state keeps to.
+        mutexes: mutex groups of cells.
+        invariants: properties that every transition preserves.
     """
 
     graphs: Graphs
@@ -70,14 +71,14 @@ class LocalGraphs:
 
 
 def instantiate(local: LocalGraphs, board: PlaneLayout) -> tuple[Layout, Graphs, Graphs]:
-    """Units, graphs and late graphs for a board."""
+    """Layout, graphs and synchronic graphs for a board."""
     n_factors = board.channels * board.height * board.width
     cells = board.to_planes(np.arange(n_factors)[None])[0]
     cardinalities = np.empty(n_factors, dtype=np.int64)
     for channel, values in enumerate(local.cardinalities):
         cardinalities[cells[channel]] = values
-    asked = np.concatenate([local.graphs.feature, local.synchronic.feature])
-    used = np.unique(asked[asked >= 0])
+    tested = np.concatenate([local.graphs.feature, local.synchronic.feature])
+    used = np.unique(tested[tested >= 0])
     adjacencies, later = (used[local.features[used, 0] == kind] for kind in (ADJACENCY, NEXT_ADJACENCY))
     layout = make_layout([int(c) for c in cardinalities], (), local.encoding, ordinal=False)
     now, then = (np.ascontiguousarray(local.features[numbers, 1:]) for numbers in (adjacencies, later))
@@ -92,12 +93,12 @@ def instantiate(local: LocalGraphs, board: PlaneLayout) -> tuple[Layout, Graphs,
 
 
 def with_invariants(layout: Layout, invariants: Invariants) -> Layout:
-    """The layout with other laws."""
+    """The layout with the given invariants."""
     return layout._replace(counts=invariants.counts, observed=invariants.observed)
 
 
 def with_mutexes(layout: Layout, mutexes: Sequence[Mutex]) -> Layout:
-    """The layout with its couplings; a cell is in the first that claims it."""
+    """The layout with the given mutex groups; a cell belongs to the first group that contains it."""
     of, exactly = layout.mutex_of.copy(), []
     groups: list[Ints] = []
     _, height, width = layout.cells.shape
@@ -114,7 +115,7 @@ def with_mutexes(layout: Layout, mutexes: Sequence[Mutex]) -> Layout:
 
 
 class _Board:
-    """Graphs of all cells while they are built. A cell's unit has the number of its factor."""
+    """Graphs of all cells while they are built. A cell's variable has the number of its factor."""
 
     def __init__(self, local: LocalGraphs, layout: Layout, adjacencies: dict[int, int]) -> None:
         self.local, self.layout, self.relative = local, layout, local.graphs
@@ -125,7 +126,7 @@ class _Board:
         self.adjacencies = adjacencies
 
     def graphs(self, graphs: Graphs) -> Graphs:
-        """All of them, from those of relative columns."""
+        """The graphs of all cells, from graphs with relative features."""
         local, layout, self.relative = self.local, self.layout, graphs
         _, height, width = layout.cells.shape
         pairs = np.concatenate([[0], np.cumsum(layout.encoding.n_action_classes * layout.outputs)]).astype(np.int64)
@@ -180,7 +181,7 @@ class _Board:
         return sorted(found)
 
     def _copy(self, nodes: Sequence[int], shared: dict[int, int], y: int, x: int) -> dict[int, int]:
-        """Nodes for a position; what the border decides there is decided."""
+        """Nodes for a position; tests whose result the border determines are resolved."""
         graphs, copies = self.relative, dict(shared)
         for node in nodes:
             off, on = copies[int(graphs.off[node])], copies[int(graphs.on[node])]
@@ -189,7 +190,7 @@ class _Board:
         return copies
 
     def _absolute(self, relative: int, y: int, x: int) -> int:
-        """Column of the board that a relative column is at a position."""
+        """Number of a relative feature at a position among the features of the board, or ``_NEVER`` or ``_ALWAYS``."""
         _, height, width = self.layout.cells.shape
         kind, *parts = self.features[relative]
         if kind == ACTION:
@@ -208,7 +209,7 @@ class _Board:
         return int(begin + self.first_feature[self.layout.cells[parts[0], row, col]]) + value
 
     def _entries(self, channel: int, begin: int, copies: dict[int, int]) -> list[tuple[int, int, int]]:
-        """Entries (pair, value, node) of a unit whose pairs begin at ``begin``."""
+        """Entries (pair, value, node) of a variable whose pairs begin at ``begin``."""
         graphs = self.relative
         first, last = graphs.pairs[channel], graphs.pairs[channel + 1]
         return [
@@ -219,4 +220,4 @@ class _Board:
 
 
 _NEVER, _ALWAYS = -2, -3
-"""Columns that the border decides."""
+"""Features that are always off or on at a position, because of the border."""

@@ -1,9 +1,9 @@
-"""What every state keeps to on planes: counts that never change, and values that meet in one cell.
+"""Invariants of planes: counts of values that never change, and combinations of channel values that occur in a cell.
 
-Graphs draw cell after cell, channel after channel, so that of two things that move by chance one may be drawn in two places or
-in none, or without its colour. Where the number of cells with some value stayed the same in every transition, and where only
-some of all combinations of values were ever met in a cell, draws are conditioned on that: what breaks a law is left out, and
-what is left shares its probability. An episode's last state is free, since what is hit may well be covered there.
+Graphs draw cell after cell and channel after channel, so an object that moves at random may be drawn in two places or in none, or
+without its colour. If the number of cells with a value was the same before and after every transition, or if only some
+combinations of values were ever observed in a cell, draws are conditioned on that: outcomes that violate an invariant are
+removed, and the others are renormalised. The last state of an episode is exempt, since one object may cover another there.
 Shapes: K counts, C channels, P combinations of values.
 """
 
@@ -22,27 +22,27 @@ from mbagent.types import Bools, Floats, Ints
 from mbagent_envs.jit import compiled
 
 FEWEST_MOVES = 100
-"""Transitions, at least, in which cells took or lost a value while their number stayed the same."""
+"""Minimum number of transitions in which some cells took or lost a value while their number stayed the same."""
 
 MOST_COMBINATIONS = 1 << 20
-"""More combinations of values than so many are not kept in a table."""
+"""Maximum number of combinations of values for which a table is kept."""
 
 RARELY_NEW = 1e-3
-"""A combination never met may come up in this share of states and still count as impossible."""
+"""Maximum estimated share of states with a new combination of values for which unobserved combinations count as impossible."""
 
 MOST_TRIES = 64
-"""Draws until all laws are kept, at most."""
+"""Maximum number of repeated draws until all invariants hold."""
 
 COVERING = 256
-"""Systematic draws from which it is estimated how probable it is that all laws are kept."""
+"""Systematic draws from which the probability that all invariants hold is estimated."""
 
 
 class Invariants(NamedTuple):
-    """What every state keeps to.
+    """Invariants of all transitions.
 
     Attributes:
-        counts: channels and values of which the number of cells never changes, int64 [K, 2].
-        observed: which combinations of the channels' values are met in a cell, bool [P]; empty where any may be.
+        counts: (channel, value) pairs whose number of cells never changes, int64 [K, 2].
+        observed: which combinations of the channels' values occur in a cell, bool [P]; empty if any may occur.
     """
 
     counts: Ints
@@ -50,7 +50,7 @@ class Invariants(NamedTuple):
 
     @property
     def none(self) -> bool:
-        """Whether anything goes."""
+        """Whether there are no invariants."""
         return len(self.counts) == 0 and len(self.observed) == 0
 
 
@@ -58,13 +58,13 @@ NO_INVARIANTS = Invariants(np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=n
 
 
 def radix(cardinalities: Sequence[int]) -> Ints:
-    """What each channel's value counts in the number of a combination, int64 [C]."""
+    """Weight of each channel's value in the number of a combination, int64 [C]."""
     result: Ints = np.cumprod([1, *cardinalities], dtype=np.int64)[:-1]
     return result
 
 
 def n_combinations(cardinalities: Sequence[int]) -> int:
-    """Number of combinations of the channels' values, or 0 where they are too many for a table."""
+    """Number of combinations of the channels' values, or 0 if there are too many for a table."""
     total = 1
     for k in cardinalities:
         total *= int(k)
@@ -74,11 +74,11 @@ def n_combinations(cardinalities: Sequence[int]) -> int:
 
 
 def find_invariants(rows: TransitionBatch, board: PlaneLayout, cardinalities: Sequence[int]) -> Invariants:
-    """The laws that some transitions keep to.
+    """The invariants of some transitions.
 
     Args:
         rows: transitions.
-        board: where cells lie.
+        board: positions of the cells.
         cardinalities: number of values of each channel's cells.
     """
     return Invariants(
@@ -99,9 +99,9 @@ def _find_counts(rows: TransitionBatch, board: PlaneLayout, cardinalities: Seque
 
 
 def _find_observed(rows: TransitionBatch, board: PlaneLayout, cardinalities: Sequence[int]) -> Bools:
-    """Combinations met; nothing where any may be, or where new ones keep coming.
+    """Observed combinations; empty if any may occur, or if new ones are still being observed.
 
-    How probable it is that the next state shows a new one is told by those that were met in one state only (Good 1953).
+    The probability that the next state has a new one is estimated from those observed in only one state (Good 1953).
     """
     size, weights = n_combinations(cardinalities), radix(cardinalities)
     if size == 0 or len(cardinalities) < 2 or len(rows) == 0:
@@ -111,7 +111,7 @@ def _find_observed(rows: TransitionBatch, board: PlaneLayout, cardinalities: Seq
         planes = board.to_planes(part.after)
         code = sum(planes[:, c].astype(np.int64) * weight for c, weight in enumerate(weights))
         code = np.sort(np.asarray(code).reshape(len(part), -1), axis=1)
-        first = np.ones(code.shape, dtype=np.bool_)  # of its kind in this state
+        first = np.ones(code.shape, dtype=np.bool_)  # first occurrence of the combination in this state
         first[:, 1:] = code[:, 1:] != code[:, :-1]
         times += np.bincount(code[first], minlength=size)
     return times > 0 if (times == 1).sum() <= RARELY_NEW * len(rows) and (times == 0).any() else NO_INVARIANTS.observed
@@ -119,7 +119,7 @@ def _find_observed(rows: TransitionBatch, board: PlaneLayout, cardinalities: Seq
 
 @compiled
 def keeps(counts: Ints, observed: Bools, weights: Ints, cells: Ints, state: Ints, following: Ints) -> bool:
-    """Whether a next state [F] keeps all laws, of which the counts are those of the state before."""
+    """Whether a next state [F] satisfies all invariants; its counts must be those of the current state."""
     n_channels, height, width = cells.shape
     for k in range(len(counts)):
         here, value, surplus = cells[counts[k, 0]], counts[k, 1], 0
@@ -161,18 +161,19 @@ def leave_out(
     first: int,
     n: int,
 ) -> int:
-    """Takes those of the outcomes ``first`` to ``first + n`` that go on and break a law out, in place; returns how many are left.
+    """Removes non-terminal outcomes among ``first`` to ``first + n`` that violate an invariant; returns how many are left.
 
-    The others that go on share their probability. Where hardly any of that keeps the laws, all stay.
+    Works in place. The other non-terminal outcomes are renormalised. If these have less than ``RARE_VALUE`` of the non-terminal
+    probability, nothing is removed.
     """
-    kept, lost = 0.0, 0.0
+    kept, removed = 0.0, 0.0
     for q in range(first, first + n):
         if not terminated[q]:
             if keeps(counts, observed, weights, cells, state, following[q]):
                 kept += probabilities[q]
             else:
-                lost += probabilities[q]
-    if lost == 0.0 or kept < RARE_VALUE * (kept + lost):
+                removed += probabilities[q]
+    if removed == 0.0 or kept < RARE_VALUE * (kept + removed):
         return n
     left = first
     for q in range(first, first + n):
@@ -180,7 +181,7 @@ def leave_out(
         if over or keeps(counts, observed, weights, cells, state, following[q]):
             following[left] = following[q]
             terminated[left] = over
-            probabilities[left] = probabilities[q] if over else probabilities[q] * (kept + lost) / kept
+            probabilities[left] = probabilities[q] if over else probabilities[q] * (kept + removed) / kept
             left += 1
     return left - first
 
@@ -206,7 +207,7 @@ def leave_out_all(
 
 
 def enforced(invariants: Invariants, weights: Ints, cells: Ints, states: Ints, found: Successors) -> Successors:
-    """Successors of states [B, F] without those that break a law."""
+    """Successors of states [B, F] without those that violate an invariant."""
     if invariants.none or len(states) == 0:
         return found
     following, over, chances = found.states.copy(), found.terminated.copy(), found.probabilities.copy()
@@ -218,7 +219,10 @@ def enforced(invariants: Invariants, weights: Ints, cells: Ints, states: Ints, f
 
 
 def kept_chances(invariants: Invariants, weights: Ints, cells: Ints, states: Ints, found: Successors) -> Floats:
-    """Probability that an outcome that goes on keeps all laws, for each row of successors; 1 where none does, or none goes on."""
+    """Probability, for each row of successors, that a non-terminal outcome satisfies all invariants, [B].
+
+    It is 1 if none satisfies them, or if all outcomes are terminal.
+    """
     rows, on = found.rows, ~found.terminated
     kept = all_kept(*invariants, weights, cells, states[rows], found.states)
     total, good = (np.bincount(rows, weights=found.probabilities * which, minlength=len(states)) for which in (on, on & kept))

@@ -1,8 +1,8 @@
-"""Planes with more transitions than fit into a table: distinct feature rows, and refinement of splits found in a sample.
+"""Planes with more transitions than fit into a table: distinct patterns, and refinement of splits found in a sample.
 
-A feature table of every cell does not fit into memory where neighbourhoods have thousands of features. In most contexts that the
-splits lead to, all transitions agree. So all cells are counted by the few features split on, and only cells of contexts in which
-they disagree get a table of all features, rare outcomes first (compare RainForest, Gehrke et al. 1998).
+A feature table of every cell does not fit into memory if neighbourhoods have thousands of features. In most contexts that the
+splits lead to, all transitions agree. So all cells are counted by the few features of the splits, and only cells of contexts in
+which outcomes differ get a table of all features, rare outcomes first (compare RainForest, Gehrke et al. 1998).
 """
 
 from __future__ import annotations
@@ -40,28 +40,28 @@ from mbagent.types import Bools, Ints
 from mbagent_envs.jit import compiled
 
 MOST_TABLE_ENTRIES = 200_000_000
-"""Entries of the table of columns that the search reads; of more transitions than that, some from all over are searched."""
+"""Maximum number of entries of the feature table for the search; of more transitions, an evenly spaced sample is searched."""
 
 QUICK_CELLS = 50_000_000
-"""As MOST_TABLE_ENTRIES, for a quick look that asks for single causes only."""
+"""As ``MOST_TABLE_ENTRIES``, for quick fits without pairwise splits."""
 
 FEWEST_CHANGES = 50
-"""Cells of a channel that must have changed as another's did, before it is taken for a copy."""
+"""Minimum number of changed cells of a channel for which it can be found to copy another channel or an action."""
 
 MOST_CELLS_COUNTED = 1_000_000_000
-"""Values of cells that are gone through in all, a byte each before and after a step."""
+"""Maximum number of cell values that are counted in all, of one byte each before and after a step."""
 
 ENTRIES_PER_CHUNK = 50_000_000
-"""Entries of the table that are made at once."""
+"""Entries of the table that are computed at once."""
 
 
 def channel_layout(cardinalities: Sequence[int], encoding: ActionEncoding) -> Layout:
-    """Channels as the factors of a layout; its own columns mean nothing."""
+    """A layout whose factors are the channels; its own features are not used."""
     return make_layout(cardinalities, (), encoding, ordinal=False)
 
 
 def _counted(rows: TransitionBatch) -> tuple[TransitionBatch, Ints]:
-    """The rows that are gone through, and their numbers."""
+    """The rows that are counted, and their numbers."""
     most = max(1, MOST_CELLS_COUNTED // max(1, rows.before.shape[1]))
     if len(rows) <= most:
         return rows, np.arange(len(rows))
@@ -70,22 +70,22 @@ def _counted(rows: TransitionBatch) -> tuple[TransitionBatch, Ints]:
 
 
 class PlaneTable:
-    """Transitions of planes, as cells with their relative columns.
+    """Transitions of planes, as cells with their relative features.
 
     Attributes:
-        table: columns of the neighbourhood of all cells that look different, bool [looks, near].
-        whole: whether it is of all transitions.
-        most_patterns: rows that a table for a search may have.
-        every: planes of all transitions and of their next states; of evenly chosen ones where that were over MOST_CELLS_COUNTED.
+        table: neighbourhood features of all distinct patterns of cells, bool [patterns, near].
+        whole: whether the table covers all transitions.
+        most_patterns: maximum number of rows of a table for a search.
+        every: planes of all transitions and of their next states; of an evenly spaced subset beyond ``MOST_CELLS_COUNTED``.
 
     Args:
         rows: N transitions.
-        board: where cells lie.
+        board: positions of the cells.
         cardinalities: number of values of each channel's cells, length C.
-        features: all relative columns, int64 [D, 7].
+        features: all relative features, int64 [D, 7].
         encoding: the actions.
         since: first row that counts for each channel and for ``terminated``, int64 [C + 1]; None for all.
-        in_pairs: whether to look for causes that matter only together, which takes most of the time.
+        in_pairs: whether to search for pairwise splits, which takes most of the time.
     """
 
     def __init__(
@@ -122,9 +122,9 @@ class PlaneTable:
         self.actions = np.repeat(encoding.action_class[self.rows.actions], self.n_cells)
 
     def _patterns(self, planes: Factors, actions: Ints) -> tuple[Bools, Ints, Ints]:
-        """Columns of all cells that look different, which each cell looks like, and which transitions that is of.
+        """Features of the distinct patterns of cells, the pattern of each cell, and the transitions that were used.
 
-        Transitions from all over are taken as long as there is room.
+        Evenly spaced transitions are added until there are ``most_patterns`` patterns.
         """
         most, step = self.most_patterns, max(1, ENTRIES_PER_CHUNK // (self.n_cells * max(len(self.near), 1)))
         patterns_seen, n_parts = np.zeros((0, -(-len(self.near) // 8)), dtype=np.uint8), -(-len(planes) // step)
@@ -137,7 +137,7 @@ class PlaneTable:
             first, of = distinct(packed)
             both, known = np.concatenate([patterns_seen, packed[first]]), len(patterns_seen)
             kept, now = distinct(both)
-            renamed = np.argsort(np.argsort(kept, kind="stable"), kind="stable")[now]  # looks known before keep their numbers
+            renamed = np.argsort(np.argsort(kept, kind="stable"), kind="stable")[now]  # earlier patterns keep their numbers
             patterns_seen = both[np.sort(kept)]
             pattern.append(renamed[known:][of].reshape(len(part), self.n_cells))
             taken.append(part)
@@ -147,7 +147,7 @@ class PlaneTable:
         return table, np.concatenate(pattern)[order].ravel(), rows[order]
 
     def observed(self, channel: int) -> Observed:
-        """A channel's values in all cells; looks are rows of ``table``."""
+        """A channel's values in all cells; patterns are rows of ``table``."""
         now, then = (planes[:, channel].reshape(-1).astype(np.int64) for planes in (self.before, self.after))
         return Observed(self.pattern, self.actions, now, then).select(self.cells_since(channel))
 
@@ -159,32 +159,32 @@ class PlaneTable:
         return determined_by(channel, self.features, self.near, *self.every, self.every_action)
 
     def copying(self, channel: int, features: Ints) -> tuple[list[Question], Bools]:
-        """The questions about a channel that some columns alone tell all of, with the table of those columns."""
+        """The questions about a channel that the given features determine, with the table of those features."""
         observed, cardinality = self.observed(channel), self.cardinalities[channel]
         determined = feature_values(self.features[features], self.before, self.rows.actions)[self.cells_since(channel)]
         value = np.concatenate([determined, np.ones((len(determined), 1), dtype=np.bool_)], axis=1).argmax(axis=1)
-        look = (observed.actions * cardinality + observed.now) * (len(features) + 1) + value
+        pattern = (observed.actions * cardinality + observed.now) * (len(features) + 1) + value
         first = np.full(self.encoding.n_action_classes * cardinality * (len(features) + 1), -1)
-        first[look[::-1]] = np.arange(len(look))[::-1]
-        return ask(channel, cardinality, replace(observed, pattern=look)), determined[first]
+        first[pattern[::-1]] = np.arange(len(pattern))[::-1]
+        return ask(channel, cardinality, replace(observed, pattern=pattern)), determined[first]
 
     def cells_since(self, channel: int) -> Ints:
         """Numbers of the cells that count for a channel."""
         return np.arange(min(self.since[channel] * self.n_cells, len(self.actions)), len(self.actions))
 
     def far_values(self, numbers: Ints) -> Bools:
-        """Columns that are the same at all positions, bool [N, len(numbers)]."""
+        """Features that are the same at all positions, bool [N, len(numbers)]."""
         found = [far_value(self.features[d], self.before, self.rows.actions, self.after) for d in numbers]
         return np.stack(found, axis=1)
 
     def split(self, asked: Sequence[Question], table: Bools, numbers: Ints) -> list[Search]:
-        """Splits by columns of a table, which have these numbers among the relative ones."""
+        """Finished searches with a table of the relative features ``numbers``."""
         kinds = feature_kinds(self.features)[numbers]
         found = find_splits([q.target for q in asked], table, kinds, self.encoding.n_action_classes, self.in_pairs)
         return [search.renamed(numbers) for search in found]
 
     def build(self, asked: Sequence[Question], found: Sequence[Search]) -> Graphs:
-        """Graphs of channels, ``terminated`` and the event that never happens."""
+        """Graphs of channels, ``terminated`` and the reset, which never happens."""
         observed = [self.observed(channel) for channel in range(len(self.cardinalities))]
         smoothings = [
             smoothing_of(k, self.encoding.n_action_classes, s.actions, s.now, s.then)
@@ -200,46 +200,46 @@ class PlaneTable:
 
 
 REFINEMENTS = 6
-"""Most times that all transitions are gone through."""
+"""Maximum number of rounds of refinement, each of which counts all transitions."""
 
 WORTH_SEARCHING = 10.0
-"""Evidence, nats, that could be gained in a context at most, below which nothing is looked for in it."""
+"""Minimum log evidence, in nats, that could be gained in a context at most, for it to be searched."""
 
 
 FEWEST_ROOM = 300
-"""Cells of the more frequent outcome that are taken at least."""
+"""Minimum number of sampled cells of the more frequent outcome, if there are as many."""
 
 
 def refine(planes: PlaneTable, asked: Sequence[Question], found: list[Search]) -> list[Search]:
-    """Searches that go on in all transitions where some were searched; as they are where all were.
+    """Continues searches that were made on a sample, with all transitions; others are returned unchanged.
 
     Args:
         planes: the transitions.
         asked: the questions about channels.
-        found: what was found for each in some transitions.
+        found: the search of each on the sample.
 
     Returns:
         Searches with further splits, whose rows are counts of all transitions: one for each context.
     """
     if planes.whole or not asked:
         return found
-    followed = [_Followed(planes, question, search) for question, search in zip(asked, found, strict=True)]
+    refined = [_Refined(planes, question, search) for question, search in zip(asked, found, strict=True)]
     most, certain = planes.most_patterns, certainty(found)
     for _ in range(REFINEMENTS):
-        if not _round(planes, followed, most, certain):
+        if not _round(planes, refined, most, certain):
             break
-    return [each.search() for each in followed]
+    return [each.search() for each in refined]
 
 
-class _Followed:
-    """A question followed through all cells.
+class _Refined:
+    """A question whose contexts are counted over all cells.
 
     Attributes:
         splits: all splits so far.
-        context: of each cell, int32 [N * P]; -1 where it is not asked.
-        n, e: cells and arrivals of each context, int64 [C].
+        context: context of each cell, int32 [N * P]; -1 if the question does not apply to it.
+        n, e: cells and positives of each context, int64 [C].
         action, value, prior_mean: of each context, see ``Target`` and ``Search``.
-        closed: contexts in which nothing more was found, bool [C].
+        closed: contexts in which no further split was found, bool [C].
     """
 
     def __init__(self, planes: PlaneTable, question: Question, search: Search) -> None:
@@ -256,12 +256,12 @@ class _Followed:
         self.follow(search.splits)
 
     def positives(self) -> Bools:
-        """In which cells the value came, bool [N * P]."""
+        """In which cells the value came next, bool [N * P]."""
         result: Bools = (self.planes.every[1][:, self.channel] == self.question.values[0]).ravel()
         return result
 
     def follow(self, splits: Sequence[Split]) -> None:
-        """Takes all cells through further splits, and counts them."""
+        """Moves all cells to their contexts under further splits, and counts them."""
         planes = self.planes
         used = np.unique([split.feature for split in splits if split.feature >= 0]).astype(np.int64)
         which = np.asarray([np.searchsorted(used, s.feature) if s.feature >= 0 else -1 for s in splits], dtype=np.int64)
@@ -274,32 +274,32 @@ class _Followed:
             cells = self.context[begin * planes.n_cells : (begin + step) * planes.n_cells]
             _walk(values.reshape(len(used), len(cells)), which, first, targets, cells)
         self.splits += splits
-        asked, size = self.context >= 0, len(self.action)
-        self.n = np.bincount(self.context[asked], minlength=size)
-        self.e = np.bincount(self.context[asked & self.positives()], minlength=size)
+        included, size = self.context >= 0, len(self.action)
+        self.n = np.bincount(self.context[included], minlength=size)
+        self.e = np.bincount(self.context[included & self.positives()], minlength=size)
 
     def search(self) -> Search:
-        """The splits, with counts for rows."""
+        """A search with these splits, whose rows are the contexts."""
         contexts = np.arange(len(self.action))
         search = Search(Target(contexts, self.n, self.e, contexts, self.action, self.value))
         search.splits, search.prior_mean = self.splits, self.prior_mean
         return search
 
     def open_contexts(self, tables: Tables) -> Bools:
-        """Contexts in which cells disagree, bool [C]."""
+        """Contexts with both outcomes that are worth searching, bool [C]."""
         result: Bools = ~self.closed & (-evidences(self.e, self.n, tables) > WORTH_SEARCHING) & (self.e > 0) & (self.e < self.n)
         return result
 
     def graft(self, found: Sequence[Search], contexts: Ints, near: Ints) -> bool:
-        """Takes over what was found in some contexts; whether anything was.
+        """Appends the splits that were found in some contexts; returns whether there are any.
 
         Args:
-            found: a search of each, whose columns are numbers of ``near``.
+            found: the search of each context, whose features are indices of ``near``.
             contexts: ascending, int64 [K].
-            near: columns.
+            near: numbers of features.
         """
         splits, rates = [], self.e / np.maximum(self.n, 1)
-        for context, search in zip(contexts[::-1], found[::-1], strict=True):  # those before keep their numbers
+        for context, search in zip(contexts[::-1], found[::-1], strict=True):  # last first: earlier contexts keep their numbers
             if not search.splits:
                 self.closed[context] = True
                 continue
@@ -320,14 +320,14 @@ class _Followed:
         return bool(splits)
 
 
-def _round(planes: PlaneTable, followed: Sequence[_Followed], most: int, certain: float) -> bool:
-    """Searches on in the contexts in which cells disagree; whether any split was found."""
-    tables = evidence_tables(max(int(each.n.max(initial=0)) for each in followed) + 1, certain)
-    opened = [np.flatnonzero(each.open_contexts(tables)) for each in followed]
-    limit = _water_level([np.minimum(f.e, f.n - f.e)[o] for f, o in zip(followed, opened, strict=True)], most // 4)
+def _round(planes: PlaneTable, refined: Sequence[_Refined], most: int, certain: float) -> bool:
+    """Continues the searches in contexts with both outcomes; returns whether any split was found."""
+    tables = evidence_tables(max(int(each.n.max(initial=0)) for each in refined) + 1, certain)
+    opened = [np.flatnonzero(each.open_contexts(tables)) for each in refined]
+    limit = _cells_per_context([np.minimum(r.e, r.n - r.e)[o] for r, o in zip(refined, opened, strict=True)], most // 4)
     chosen: list[Ints] = []
     searches: list[list[Search]] = []
-    for each, contexts in zip(followed, opened, strict=True):
+    for each, contexts in zip(refined, opened, strict=True):
         searches.append(_sampled(each, contexts, limit, chosen))
     every = [search for some in searches for search in some]
     if not every:
@@ -338,12 +338,12 @@ def _round(planes: PlaneTable, followed: Sequence[_Followed], most: int, certain
     kinds = feature_kinds(planes.features)[planes.near]
     tables = evidence_tables(len(table) + 1, certain)
     go_on(every, table, feature_blocks(table), kinds, planes.encoding.n_action_classes, tables, planes.in_pairs)
-    grown = [each.graft(some, contexts, planes.near) for each, some, contexts in zip(followed, searches, opened, strict=True)]
+    grown = [each.graft(some, contexts, planes.near) for each, some, contexts in zip(refined, searches, opened, strict=True)]
     return any(grown)
 
 
-def _water_level(rarer: Sequence[Ints], room: int) -> int:
-    """How many cells of its rarer outcome a context may have, where there is room for so many in all."""
+def _cells_per_context(rarer: Sequence[Ints], room: int) -> int:
+    """Maximum number of cells of the rarer outcome for each context, so that their sum is at most ``room``."""
     counts = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *rarer]))
     below = np.concatenate([[0], np.cumsum(counts)])
     for i, count in enumerate(counts):
@@ -352,14 +352,14 @@ def _water_level(rarer: Sequence[Ints], room: int) -> int:
     return room
 
 
-def _sampled(each: _Followed, contexts: Ints, limit: int, chosen: list[Ints]) -> list[Search]:
-    """A search of some cells of each of some contexts; the cells are added to ``chosen``, and their rows numbered as there.
+def _sampled(each: _Refined, contexts: Ints, limit: int, chosen: list[Ints]) -> list[Search]:
+    """A search for each context on a sample of its cells; the cells are added to ``chosen``, and rows are numbered as there.
 
-    Of the rarer outcome, evenly spaced cells are taken; of the other one, three times as many plus ``FEWEST_ROOM``. Sampled
-    cells are unweighted: a feature absent from the sample may still occur in the population. Such a sample identifies
-    discriminative features but not base rates, so each context is searched separately.
+    Of the rarer outcome, up to ``limit`` evenly spaced cells are taken; of the other one, three times as many plus
+    ``FEWEST_ROOM``. Sampled cells are unweighted: a feature absent from the sample may still occur in the population. Such a
+    sample identifies discriminative features but not base rates, so each context is searched separately.
     """
-    number = np.full(len(each.action) + 1, -1, dtype=np.int32)  # the last one: of cells that are not asked
+    number = np.full(len(each.action) + 1, -1, dtype=np.int32)  # the last entry: cells without a context
     number[contexts] = np.arange(len(contexts))
     inside = np.flatnonzero(number[each.context] >= 0)
     group = 2 * number[each.context[inside]] + each.positives()[inside]
@@ -382,14 +382,14 @@ def _sampled(each: _Followed, contexts: Ints, limit: int, chosen: list[Ints]) ->
 
 @compiled
 def _walk(values: Bools, which: Ints, first: Ints, targets: Ints, context: NDArray[np.int32]) -> None:
-    """Takes cells through splits: ``context`` [n] is changed.
+    """Moves cells through splits: changes ``context`` in place.
 
     Args:
-        values: columns, bool [U, n].
-        which: the column of each split, int64 [S]; -1 for none.
+        values: features, bool [U, n].
+        which: the feature of each split, int64 [S]; -1 for none.
         first: where the targets of each split begin, int64 [S + 1].
-        targets: new context of each old one, where the column is off and on, int64 [2, sum of contexts].
-        context: int32 [n]; negative where there is none.
+        targets: new context of each old one if the feature is off and on, int64 [2, sum of contexts].
+        context: context of each cell, int32 [n]; negative for none.
     """
     for cell in range(len(context)):
         now = context[cell]

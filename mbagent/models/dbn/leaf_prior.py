@@ -1,4 +1,4 @@
-"""Rates of leaves, where some things are random and others certain."""
+"""Spike-and-slab priors of the rates in leaves (Mitchell and Beauchamp 1988), estimated from all leaves (empirical Bayes)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mbagent.models.dbn.splits import Search
 from mbagent.types import Floats, Ints
 
 CERTAIN_RATE = 0.02
-"""Typical rates are taken to lie this far from 0 and 1 at least."""
+"""Minimum distance of prior means from 0 and 1."""
 
 WIDTH = 0.25
 """Logits from one component of a mixture to the next, and each one's standard deviation."""
@@ -21,38 +21,38 @@ CENTRES: Floats = special.expit(np.arange(-9.5, 9.5 + WIDTH, WIDTH))
 """Mean rates of the components, which are Beta distributions."""
 
 UP, DOWN = 1.0 / WIDTH**2 / (1.0 - CENTRES), 1.0 / WIDTH**2 / CENTRES
-"""Their parameters."""
+"""Parameters of the components."""
 
 MIXED_STRENGTH = 0.3
-"""Rows that the typical rate counts for beside a mixture."""
+"""Rows that the prior mean counts for in addition to a mixture."""
 
 EM_STEPS = 60
 """Rounds of expectation and maximisation."""
 
 LEAST_RATE = 1e-8
-"""Least weight of a rate in a mixture: nothing is impossible."""
+"""Minimum weight of a component of a mixture, so that no rate is impossible."""
 
 MOST_LEAVES = 20_000
-"""Leaves that a mixture is fitted to; of more, evenly chosen ones."""
+"""Maximum number of leaves that a mixture is fitted to; of more, an evenly spaced subset is used."""
 
 WORTHWHILE = 40.0
-"""Evidence, nats, that a fitted mixture must have beyond the best simple prior: its weights are not free."""
+"""Log evidence, in nats, by which a fitted mixture must exceed the best simple prior, since its weights are free parameters."""
 
 
 @dataclass(frozen=True)
 class LeafPrior:
-    """What is believed of a leaf's rate before its rows are seen: a spike at 0 and 1, and a slab around the typical rate.
+    """Prior of a leaf's rate: a spike at 0 and 1, and a Beta distribution around the prior mean (the slab).
 
     Attributes:
-        certain: probability that nothing about the leaf is random.
-        strength: rows that the typical rate counts for otherwise.
+        certain: probability that the leaf is deterministic.
+        strength: rows that the prior mean counts for otherwise.
     """
 
     certain: float
     strength: float
 
     def evidence(self, n: Ints, e: Ints, prior_mean: Floats) -> tuple[Floats, Floats]:
-        """Log-probability of ``e`` of ``n`` rows, in their order, and the posterior probability of the slab."""
+        """Log-probability of ``e`` positives in ``n`` rows, in their order, and the posterior probability of the slab."""
         return _with_spike(self._slab(n, e, prior_mean)[0], self.certain, n, e, prior_mean)
 
     def rates(self, n: Ints, e: Ints, prior_mean: Floats) -> Floats:
@@ -65,17 +65,17 @@ class LeafPrior:
         return result
 
     def _slab(self, n: Ints, e: Ints, prior_mean: Floats) -> tuple[Floats, Floats]:
-        """Log-probability of the rows and their mean rate where something is random."""
+        """Log-probability of the rows under the slab, and their posterior mean rate."""
         up, down = self.strength * prior_mean, self.strength * (1.0 - prior_mean)
         return special.betaln(up + e, down + n - e) - special.betaln(up, down), (e + up) / (n + self.strength)
 
 
 @dataclass(frozen=True)
 class MixedPrior(LeafPrior):
-    """The slab has the shape that the rates of all leaves have: a world with few kinds of luck has few rates.
+    """A prior whose slab is the distribution of the rates of all leaves, since many environments have only few different rates.
 
-    The distribution of the rates is the likeliest mixture of narrow Beta distributions (after Kiefer and Wolfowitz 1956, and
-    Laird 1978); the typical rate counts for ``strength`` rows beside it. With equal weights it is about the simple prior.
+    The slab is the maximum-likelihood mixture of narrow Beta distributions (after Kiefer and Wolfowitz 1956, and Laird 1978); in
+    addition, the prior mean counts for ``strength`` rows. With equal weights it is about the simple prior.
 
     Attributes:
         weights: of the components, see CENTRES.
@@ -93,12 +93,12 @@ class MixedPrior(LeafPrior):
 
 
 def best_prior(searches: Sequence[Search]) -> LeafPrior:
-    """The simple prior under which the leaves found are likeliest."""
+    """The simple prior with the highest evidence of the leaves."""
     return _best_of(PRIORS, *_leaves(searches))
 
 
 def fitted_prior(searches: Sequence[Search]) -> LeafPrior:
-    """As ``best_prior``; a mixture fitted to the leaves where they clearly are likelier then."""
+    """As ``best_prior``, or a mixture fitted to the leaves if its evidence is clearly higher."""
     n, e, prior_mean = _leaves(searches)
     simple, observed = _best_of(PRIORS, n, e, prior_mean), np.flatnonzero(n)
     if len(observed) == 0:
@@ -111,7 +111,7 @@ def fitted_prior(searches: Sequence[Search]) -> LeafPrior:
 
 
 def _leaves(searches: Sequence[Search]) -> tuple[Ints, Ints, Floats]:
-    """Rows, arrivals and typical rate of all leaves."""
+    """Rows, positives and prior mean of all leaves."""
     counts = [search.counts() for search in searches]
     nothing = np.zeros(0, dtype=np.int64)
     n, e = (np.concatenate([nothing, *(pair[i] for pair in counts)]) for i in (0, 1))
@@ -123,7 +123,7 @@ def _best_of(priors: Sequence[LeafPrior], n: Ints, e: Ints, prior_mean: Floats) 
 
 
 def _with_spike(slab: Floats, certain: float, n: Ints, e: Ints, prior_mean: Floats) -> tuple[Floats, Floats]:
-    """Evidence of leaves whose evidence is ``slab`` if anything is random, and the posterior probability that it is."""
+    """Evidence of leaves with spike and slab, given the evidence under the slab alone, and the slab's posterior probability."""
     slab = slab + np.log1p(-certain)
     with np.errstate(divide="ignore"):
         spike = np.log(certain * ((e == 0) * (1.0 - prior_mean) + (e == n) * prior_mean))
@@ -132,14 +132,14 @@ def _with_spike(slab: Floats, certain: float, n: Ints, e: Ints, prior_mean: Floa
 
 
 def _likelihoods(n: Ints, e: Ints, prior_mean: Floats, strength: float) -> Floats:
-    """Log-probability [N, K] of the leaves' rows, and of what the typical rate counts for, under each component."""
+    """Log-probability [N, K] of the leaves' rows, with those that the prior mean counts for, under each component."""
     up, down = e + strength * prior_mean, n - e + strength * (1.0 - prior_mean)
     result: Floats = special.betaln(UP + up[:, None], DOWN + down[:, None]) - special.betaln(UP, DOWN)
     return result
 
 
 def _mixture(certain: float, n: Ints, e: Ints, prior_mean: Floats) -> MixedPrior:
-    """The mixture under which leaves are likeliest, by expectation and maximisation from a simple prior on."""
+    """The maximum-likelihood mixture, by expectation and maximisation from equal weights and ``certain`` of a simple prior."""
     rows, before = (_likelihoods(k * n, k * e, prior_mean, MIXED_STRENGTH) for k in (1, 0))
     top = rows.max(axis=1)
     rows, before, weights = np.exp(rows - top[:, None]), np.exp(before), np.full(len(CENTRES), 1.0 / len(CENTRES))

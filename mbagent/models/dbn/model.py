@@ -30,42 +30,42 @@ from mbagent.types import Bools, Floats
 
 
 def tested_features(graphs: Graphs, variable: int) -> set[int]:
-    """Columns that the graphs of a unit ask for."""
+    """Features that the graphs of a variable test."""
     if variable not in graphs.changing:
         return set()
     begin, end = graphs.entries[graphs.pairs[variable]], graphs.entries[graphs.pairs[variable + 1]]
-    stack, observed = [int(node) for node in graphs.nodes[begin:end]], set()
+    stack, visited = [int(node) for node in graphs.nodes[begin:end]], set()
     while stack:
         node = stack.pop()
-        if node not in observed:
-            observed.add(node)
+        if node not in visited:
+            visited.add(node)
             if graphs.feature[node] >= 0:
                 stack += [int(graphs.off[node]), int(graphs.on[node])]
-    return {int(graphs.feature[node]) for node in observed if graphs.feature[node] >= 0}
+    return {int(graphs.feature[node]) for node in visited if graphs.feature[node] >= 0}
 
 
 def depends_on_action(graphs: Graphs, variable: int, layout: Layout) -> bool:
-    """Whether what a unit does differs from action to action."""
+    """Whether the graphs of a variable differ between action classes."""
     n, first = int(layout.outputs[variable]), int(graphs.pairs[variable])
 
-    def action_classes(pair: int) -> list[tuple[int, int]]:
+    def entries_of(pair: int) -> list[tuple[int, int]]:
         entries = range(graphs.entries[first + pair], graphs.entries[first + pair + 1])
         return [(int(graphs.values[e]), int(graphs.nodes[e])) for e in entries]
 
     return any(
-        action_classes(action_class * n + value) != action_classes(value)
+        entries_of(action_class * n + value) != entries_of(value)
         for value in range(n)
         for action_class in range(1, layout.encoding.n_action_classes)
     )
 
 
 def parent_factors(layout: Layout, features: set[int]) -> set[int]:
-    """Factors that state columns are about; those of the next state are left out."""
+    """Factors of state features; features of the next state are left out."""
     return {int(layout.factor[feature]) for feature in features if feature < len(layout.factor)}
 
 
 def flat_variables(layout: Layout, graphs: Graphs, synchronic: Graphs) -> list[Variable]:
-    """Factors and groups that have graphs, and what they hang on besides themselves."""
+    """Factors and groups that have graphs, and their parents other than themselves."""
     n, after, found = len(layout.factor), len(layout.factor) + layout.encoding.n_features, []
     for variable in graphs.changing[graphs.changing < len(layout.outputs) - 2]:
         factors = tuple(int(f) for f in layout.members[layout.first[variable] : layout.first[variable + 1]])
@@ -80,45 +80,47 @@ def flat_variables(layout: Layout, graphs: Graphs, synchronic: Graphs) -> list[V
 
 
 IMPOSSIBLE_LOG_PROB = -200.0
-"""Log-probability that an impossible transition is charged with when models are compared."""
+"""Log-probability that counts for an impossible transition when models are compared."""
 
 FEWEST_RESETS = 4
-"""Rare events that there must be to learn anything of them."""
+"""Minimum number of candidate resets for which a regime of its own is tried."""
 
 ENOUGH_RESETS, MOST_FOLDS = 5, 10
-"""So many held-out rare events tell whether they are events at all; where one split has fewer, others follow, up to so many."""
+"""Held-out candidate resets that are enough to decide about the regime; if one split has fewer, further splits follow, up to a
+maximum number."""
 
 MOST_VALUES = 200_000_000
-"""Values of factors that are learned from at once, which takes up to some ten bytes each; of more transitions than have so
-many, evenly chosen ones are."""
+"""Maximum number of factor values that a model is fitted to, at about ten bytes each; of more transitions, an evenly spaced
+subset is used."""
 
 MOST_EFFECT_COUNTS = 20_000_000
-"""Contexts times columns of a question about how far a factor moves."""
+"""Maximum number of contexts times features of a question for which effects other than absolute ones are tried."""
 
 DESCRIBED = 2000
-"""Held-out transitions that figures of single variables are made from."""
+"""Held-out transitions that the figures of single variables are computed from."""
 
 WORTH_TELLING = 0.03
-"""What the past tells is worth telling beyond this share of what cannot be foretold, plus one nat."""
+"""Minimum gain from the previous step for it to be reported, as a share of one nat plus the held-out loss."""
 
 
 class DecisionGraphModel(GraphPredictions):
-    """Each variable's next value by a small decision graph over the few columns that it hangs on.
+    """A transition model that predicts each variable's next value by small decision graphs over the few features it depends on.
 
-    Bits of which exactly one is on are drawn as one variable. Rare events that redraw almost everything have graphs of
-    their own, and one for whether they happen. Probabilities are exact, but that ``log_prob`` and ``marginals`` grant what never
-    changed a tiny probability to change, which draws leave out. A fit takes a second or a few, with very many values more.
+    Bits of which exactly one is on are drawn as one variable. Resets, rare transitions that redraw almost everything, have graphs
+    of their own and one for whether they happen. Probabilities are exact, except that ``log_prob`` and ``marginals`` give
+    variables that never changed a tiny probability of changing, which samples ignore. A fit takes a few seconds, and longer with
+    very many values.
 
     Args:
         cardinalities: number of values of each state factor, length F.
         n_actions: number of enumerated actions A.
-        validation: share of episodes held out, for the report and for the choice whether there are rare events; the
-            graphs are fitted to all rows in the end.
-        parts: number of values of each part of an action, such as (2, 2, 2) for three switches, numbered as
-            ``ActionEnumeration`` does; each part is a cause for itself then. None: an action is one thing.
+        validation: share of episodes held out, for the report and for choices between variants of the model; the final graphs
+            are fitted to all rows.
+        parts: number of values of each action component, such as (2, 2, 2) for three switches, numbered as by
+            ``ActionEnumeration``; each component then has features of its own. None: actions have no components.
 
     Raises:
-        ValueError: so many parts do not make so many actions.
+        ValueError: the numbers of values in ``parts`` do not multiply to ``n_actions``.
     """
 
     def __init__(
@@ -128,7 +130,7 @@ class DecisionGraphModel(GraphPredictions):
         super().__init__(cardinalities, n_actions)
         self.validation, self.parts = validation, (n_actions,) if parts is None else tuple(parts)
         if math.prod(self.parts) != n_actions:
-            raise ValueError(f"Actions with {self.parts} values of their parts are {math.prod(self.parts)}, not {n_actions}.")
+            raise ValueError(f"Action parts with {self.parts} values make {math.prod(self.parts)} actions, not {n_actions}.")
         self.encoding = action_encoding(self.parts)
         layout = make_layout(self.cardinalities, (), self.encoding)
         none = np.zeros(0, dtype=np.int64)
@@ -139,7 +141,7 @@ class DecisionGraphModel(GraphPredictions):
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel."""
-        began, n_met = time.perf_counter(), len(data)
+        began, n_observed = time.perf_counter(), len(data)
         data = within(data, MOST_VALUES)
         rows, resets = data.rows(), self._resets(data, seed)
         since = self._since(rows, resets)
@@ -149,7 +151,7 @@ class DecisionGraphModel(GraphPredictions):
         flagged = flag_resets(train.before, train.after) & resets.any()
         effects = self._effects(train, flagged, held_out)
         self.fitted = fit_graphs(self.cardinalities, self.encoding, train, flagged, effects=effects, since=train_since)
-        likelihood, jointly = self._jointly(held_out)
+        likelihood, jointly = self._compare_synchronic(held_out)
         if progress is not None:
             progress(0.7)
         exact, (variables, calibration) = self._exact_match(held_out), self._described(held_out)
@@ -157,15 +159,15 @@ class DecisionGraphModel(GraphPredictions):
         if progress is not None:
             progress(1.0)
         figures = {"nodes": float(len(self.fitted.usual.feature)), "events": float(resets.sum())}
-        figures |= {"changed": float((since > 0).sum()), "left out": float(n_met - len(rows))}
+        figures |= {"changed": float((since > 0).sum()), "left out": float(n_observed - len(rows))}
         report = self._report((len(rows), len(held_out)), likelihood, exact, figures)
         memory = self._memory(train, held_out)
         report = replace(report, variables=variables, calibration=calibration, memory=memory)
         return replace(report, seconds=time.perf_counter() - began)
 
     def _since(self, rows: TransitionBatch, resets: Bools) -> NDArray[np.int64]:
-        """First row that tells of each factor, and of ``terminated``, as it is now, int64 [F + 1]."""
-        usual, before = np.flatnonzero(~resets), self._kept()
+        """First row from which the present rules of each factor and of ``terminated`` hold, int64 [F + 1]."""
+        usual, before = np.flatnonzero(~resets), self._snapshot()
         groups = find_groups(self.cardinalities, rows.states, rows.next_states, ~resets)
         variable = np.arange(len(self.cardinalities) + 1)
         for group in groups:
@@ -175,7 +177,7 @@ class DecisionGraphModel(GraphPredictions):
 
         def log_predictive(train: TransitionBatch, tests: TransitionBatch) -> Floats:
             logs = self._factor_log_probs(train, tests)
-            logs[:, :-1][grouped & (tests.next_states == 0)] = 0.0  # a group's value is told by the bit that is on
+            logs[:, :-1][grouped & (tests.next_states == 0)] = 0.0  # only the bit that is on counts for a group
             return np.stack([logs[:, variable == v].sum(axis=1) for v in range(variable.max() + 1)], axis=1)
 
         self.fitted = replace(self.fitted, has_reset=False)
@@ -186,7 +188,7 @@ class DecisionGraphModel(GraphPredictions):
     def _split(
         self, data: TransitionDataset, seed: int, since: NDArray[np.int64]
     ) -> tuple[TransitionBatch, TransitionBatch, NDArray[np.int64]]:
-        """Training and held-out rows, and ``since`` among the former; what came before a change is not held out."""
+        """Training and held-out rows, and ``since`` as numbers of training rows; only rows after all changes are held out."""
         rows, mask = data.rows(), data.held_out(self.validation, seed)
         if not since.any():
             return (*data.split(self.validation, seed), since)
@@ -197,15 +199,15 @@ class DecisionGraphModel(GraphPredictions):
         return rows.select(~mask), rows.select(mask), np.searchsorted(np.flatnonzero(~mask), since)
 
     def _factor_log_probs(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
-        """Log-probability of each factor's next value and of the end, [T, F + 1], after a quick look at other transitions."""
-        before = self._kept()
-        self._look(train)
+        """Log-probability of each factor's next value and of termination, [T, F + 1], after a quick fit to other transitions."""
+        before = self._snapshot()
+        self._fit_quickly(train)
         probs, start = self.marginals(tests.states, tests.actions), np.concatenate([[0], np.cumsum(self.cardinalities)])
         chosen = np.take_along_axis(probs, start[:-1] + tests.after, axis=1)
         ends = [
             self.log_prob(tests.states, tests.actions, tests.next_states, np.full(len(tests), over)) for over in (False, True)
         ]
-        ends = [np.maximum(logs, -1e3) for logs in ends]  # an impossible state says nothing of the end
+        ends = [np.maximum(logs, -1e3) for logs in ends]  # an impossible state is no evidence about the end
         over = np.where(tests.terminated, ends[1], ends[0]) - np.logaddexp(*ends)
         self._restore(before)
         return np.concatenate([np.log(chosen.clip(1e-9)), over.clip(-20.0)[:, None]], axis=1)
@@ -216,11 +218,11 @@ class DecisionGraphModel(GraphPredictions):
         return describe(self.cardinalities, self.marginals(some.states, some.actions), some, self._variables())
 
     def _variables(self) -> list[Variable]:
-        """What is reported of."""
+        """The variables that are described in the report."""
         return flat_variables(self.fitted.layout, self.fitted.usual, self.fitted.synchronic)
 
     def _memory(self, train: TransitionBatch, held_out: TransitionBatch) -> float | None:
-        """What the step before tells beyond the present, nats a transition; see FitReport."""
+        """Gain in log-likelihood from the previous step, in nats for each transition; see FitReport."""
         known, tests = steps_in_a_row(train, SOME_ROWS), steps_in_a_row(held_out, SOME_TESTS)
         if min(len(known[0]), len(tests[0])) < 2:
             return None
@@ -240,34 +242,34 @@ class DecisionGraphModel(GraphPredictions):
         return DecisionGraphModel(space.cardinalities, self.n_actions, parts=self.parts)
 
     def _quick_log_probs(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
-        """Log-probabilities of transitions after a quick look at others; what was learned stays as it is."""
-        before = self._kept()
-        self._look(train)
+        """Log-probabilities of transitions after a quick fit to others; the fitted model is restored afterwards."""
+        before = self._snapshot()
+        self._fit_quickly(train)
         logs = self.log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
         self._restore(before)
         return np.maximum(logs, IMPOSSIBLE_LOG_PROB)
 
-    def _look(self, rows: TransitionBatch) -> None:
-        """Learns quickly."""
+    def _fit_quickly(self, rows: TransitionBatch) -> None:
+        """Fits without synchronic arcs."""
         resets = flag_resets(rows.before, rows.after) & self.fitted.has_reset
         self.fitted = fit_graphs(self.cardinalities, self.encoding, rows, resets, True, False)
 
-    def _kept(self) -> Any:
+    def _snapshot(self) -> Any:
         return self.fitted
 
-    def _restore(self, kept: Any) -> None:
-        self.fitted = kept
+    def _restore(self, snapshot: Any) -> None:
+        self.fitted = snapshot
 
-    def _jointly(self, held_out: TransitionBatch) -> tuple[float, bool]:
-        """Held-out likelihood, and whether it is better for drawing some units late."""
+    def _compare_synchronic(self, held_out: TransitionBatch) -> tuple[float, bool]:
+        """Held-out log-likelihood of the better variant, and whether that is the one with synchronic arcs."""
         likelihood = self._likelihood(self.fitted, held_out)
         if len(self.fitted.synchronic.changing) == 0 or len(held_out) == 0:
             return likelihood, len(self.fitted.synchronic.changing) > 0
-        apart = self._likelihood(replace(self.fitted, synchronic=no_synchronic(self.fitted.usual)), held_out)
-        return max(likelihood, apart), likelihood > apart
+        without = self._likelihood(replace(self.fitted, synchronic=no_synchronic(self.fitted.usual)), held_out)
+        return max(likelihood, without), likelihood > without
 
     def _report(self, sizes: tuple[int, int], likelihood: float, exact: float, figures: Mapping[str, float]) -> FitReport:
-        """What a fit did; ``sizes`` are the rows fitted to and held out. Of nothing held out nothing is claimed."""
+        """The report of a fit to ``sizes`` training and held-out rows; without the latter, it has no held-out scores."""
         held_out = sizes[1] > 0
         splits = [sum(split.feature >= 0 for split in search.splits) for search in self.fitted.found]
         return FitReport(
@@ -281,7 +283,7 @@ class DecisionGraphModel(GraphPredictions):
         )
 
     def _resets(self, data: TransitionDataset, seed: int) -> Bools:
-        """Which rows are rare events; none if held-out transitions are foretold better without."""
+        """Which rows are resets; none if held-out likelihood is better without a regime of resets."""
         rows = data.rows()
         resets, gain, tested = flag_resets(rows.before, rows.after), 0.0, 0
         for split in range(MOST_FOLDS if resets.sum() >= FEWEST_RESETS else 0):
@@ -298,27 +300,27 @@ class DecisionGraphModel(GraphPredictions):
         return resets & (gain > 0.0)
 
     def _effects(self, train: TransitionBatch, resets: Bools, held_out: TransitionBatch) -> dict[int, EffectModel]:
-        """How each factor is asked about: as its held-out values are foretold best."""
+        """Effect of each factor with more than two values: the one with the best held-out likelihood."""
         n_contexts, n_features = self.encoding.n_action_classes * max(self.cardinalities, default=0), 2 * sum(self.cardinalities)
-        every = [f for f, cardinality in enumerate(self.cardinalities) if cardinality > 2]
-        if not every or n_contexts * n_features > MOST_EFFECT_COUNTS or len(held_out) == 0:
+        ordinal = [f for f, cardinality in enumerate(self.cardinalities) if cardinality > 2]
+        if not ordinal or n_contexts * n_features > MOST_EFFECT_COUNTS or len(held_out) == 0:
             return {}
         folds = [(train, resets, held_out)]
         folds += [(train.select(~out), resets[~out], train.select(out)) for out in more_folds(train, held_out)]
 
         def log_probs(effect_models: Sequence[EffectModel]) -> Floats:
-            named = dict(zip(every, effect_models, strict=True))
+            named = dict(zip(ordinal, effect_models, strict=True))
             return np.concatenate([self._log_probs_with_effects(named, *fold) for fold in folds])
 
         def operands() -> Sequence[tuple[Operand, int] | None]:
-            return likely_operands(every, candidates(self.cardinalities, self.parts), train.select(~resets))
+            return likely_operands(ordinal, candidates(self.cardinalities, self.parts), train.select(~resets))
 
-        return dict(zip(every, best_effect_models(log_probs, len(every), operands), strict=True))
+        return dict(zip(ordinal, best_effect_models(log_probs, len(ordinal), operands), strict=True))
 
     def _log_probs_with_effects(
         self, effect_models: Mapping[int, EffectModel], train: TransitionBatch, resets: Bools, held_out: TransitionBatch
     ) -> Floats:
-        """Log-probability of the held-out next values of K factors, [N, K], that are asked about so."""
+        """Log-probability of the held-out next values of K factors under the given effects, [N, K]."""
         self.fitted = fit_graphs(self.cardinalities, self.encoding, train, resets, False, False, effect_models)
         start = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64)
         probs, factors = self.marginals(held_out.states, held_out.actions), list(effect_models)
@@ -327,7 +329,7 @@ class DecisionGraphModel(GraphPredictions):
         return logs
 
     def _likelihood(self, fitted: Fitted, rows: TransitionBatch) -> float:
-        """Mean log-probability of transitions; the impossible counts as ``IMPOSSIBLE_LOG_PROB``."""
+        """Mean log-probability of transitions; impossible ones count as ``IMPOSSIBLE_LOG_PROB``."""
         before, self.fitted = self.fitted, fitted
         parts = [self.log_prob(p.states, p.actions, p.next_states, p.terminated) for p in rows.parts(ROWS_AT_ONCE)]
         self.fitted, logs = before, np.concatenate([np.zeros(0), *parts])
@@ -379,14 +381,14 @@ class DecisionGraphModel(GraphPredictions):
         bits = np.flatnonzero(np.asarray(self.cardinalities) == 2)
         if len(np.unique(members)) < len(members) or not np.isin(members, bits).all() or any(len(g) < 2 for g in groups):
             raise ValueError(
-                "These weights group other bits than this model has; load them into a model of the same environment."
+                "These weights have groups of bits that this model does not have; load them into a model of the same environment."
             )
         layout = make_layout(self.cardinalities, groups, self.encoding)
         mutexes = np.asarray(state["couplings"], dtype=np.int64).reshape(-1)
         mutex_members = np.flatnonzero(mutexes >= 0)
         if len(mutexes) != len(layout.outputs) or not is_lone_bit(layout)[mutex_members].all():
             raise ValueError(
-                "These weights couple other bits than this model has; load them into a model of the same environment."
+                "These weights have mutex groups that do not fit this model; load them into a model of the same environment."
             )
         layout = layout_with_mutexes(
             layout, [mutex_members[mutexes[mutex_members] == q] for q in np.unique(mutexes[mutex_members])]

@@ -1,8 +1,8 @@
 """Mutually exclusive bits: groups of which exactly one, or at most one, is on (Helmert 2009).
 
 Groups of which exactly one is on, such as a position encoded one-hot, are found from data and become one variable (paper section
-2.1), so that their bits are drawn jointly. Of bits of which at most one is on, each has a rate of its own, given by its graph;
-these rates are the probabilities of one draw among the bits and "none".
+2.1), so that their bits are drawn jointly. If at most one of some bits is on, each bit keeps its own graph and rate; these rates
+are the probabilities of one draw among the bits and "none".
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from mbagent.types import Bools, Floats, Ints
 from mbagent_envs.jit import compiled
 
 EXPECTED = 8.0
-"""Two bits must have been expected together this often before "never" is believed: else it may be chance, one in 3,000."""
+"""Minimum expected number of joint occurrences of two bits for which having none is significant (by chance, one in 3,000)."""
 
 MOST_CANDIDATE_ROWS = 50_000
-"""Rows that candidates are looked for in; what is found is checked on all."""
+"""Maximum number of rows in the search for candidate groups, which are checked on all rows."""
 
 
 def find_groups(
     cardinalities: Sequence[int], states: Factors, next_states: Factors, usual: Bools | None = None
 ) -> tuple[tuple[int, ...], ...]:
-    """Groups of bits of which exactly one is on in every state met.
+    """Groups of bits of which exactly one is on in every observed state.
 
-    Bits that were never on together, and that are often swapped (one goes out in the step in which the other comes
-    on), are gathered greedily, the most swapped first.
+    Bits that were never on together and are often swapped (one is switched off in the step in which the other is switched on)
+    are collected greedily, the most frequent swaps first.
 
     Args:
         cardinalities: number of values of each factor, length F.
         states: int [N, F].
         next_states: int [N, F].
-        usual: bool [N], transitions to look for swaps in (rare events, which redraw all, swap anything); None: all.
+        usual: bool [N], transitions in which swaps are counted (resets, which redraw everything, swap any bits); None: all.
 
     Returns:
         Factors of each group, ascending, three or more.
@@ -50,8 +50,8 @@ def find_groups(
     some = np.linspace(0, len(states) - 1, min(len(states), MOST_CANDIDATE_ROWS)).astype(np.int64)
     before, after = states[some][:, bits] == 1, next_states[some][:, bits] == 1
     kept = slice(None) if usual is None else usual[some]
-    positives, went = (after & ~before)[kept].astype(np.float32), (before & ~after)[kept].astype(np.float32)
-    swaps = went.T @ positives
+    switched_on, switched_off = (after & ~before)[kept].astype(np.float32), (before & ~after)[kept].astype(np.float32)
+    swaps = switched_off.T @ switched_on
     swaps += swaps.T
     on = np.concatenate([before, after]).astype(np.float32)
     exclusive = on.T @ on == 0
@@ -71,11 +71,11 @@ def find_groups(
 
 
 def find_cliques(together: NDArray[np.int64], expected: NDArray[np.float64]) -> list[NDArray[np.int64]]:
-    """Sets of bits of which no two were ever on together after a step though they should have been, were each for itself.
+    """Sets of bits of which no two were ever on together after a step, although independent bits would have been.
 
     Args:
         together: how often two bits were on together, int64 [n, n].
-        expected: how often they should have been by their own probabilities, [n, n].
+        expected: how often they would be if they were independent, [n, n].
     """
     never = (together == 0) & (expected > EXPECTED)
     np.fill_diagonal(never, False)
@@ -89,7 +89,7 @@ def find_cliques(together: NDArray[np.int64], expected: NDArray[np.float64]) -> 
 
 
 def _grow(swaps: NDArray[np.floating[Any]], exclusive: Bools, free: Bools) -> NDArray[np.int64]:
-    """The clique around the strongest swap, in the order found; nothing where there is no swap left."""
+    """The clique around the strongest pair, in the order found; empty if no pair is left."""
     first, second = np.unravel_index(int(swaps.argmax()), swaps.shape)
     if swaps[first, second] == 0:
         return np.zeros(0, dtype=np.int64)
@@ -108,7 +108,7 @@ def _grow(swaps: NDArray[np.floating[Any]], exclusive: Bools, free: Bools) -> ND
 
 @compiled
 def widest(layout: Layout) -> int:
-    """Room that the distribution of any unit or coupling needs."""
+    """Size of the largest distribution of a variable or mutex group."""
     room = layout.outputs.max()
     for q in range(len(layout.exactly)):
         room = max(room, layout.mutex_first[q + 1] - layout.mutex_first[q] + 1)
@@ -117,9 +117,9 @@ def widest(layout: Layout) -> int:
 
 @compiled
 def mutex_distribution(mutex: int, state: Ints, rates: Floats, still: Bools, layout: Layout, graphs: Graphs, out: Floats) -> int:
-    """Writes the probability of each bit of a coupling, and of none, to ``out``; returns how many bits there are.
+    """Writes the probability of each bit of a mutex group, and of none, to ``out``; returns the number of bits.
 
-    ``rates`` are all units' distributions; a bit that is ``still`` [U], without graphs, is as sure as it is in ``state``.
+    ``rates`` are the distributions of all variables; bits without graphs (``still`` [U]) keep their value in ``state``.
     """
     first, last = layout.mutex_first[mutex], layout.mutex_first[mutex + 1]
     n, total = last - first, 0.0
@@ -136,7 +136,7 @@ def mutex_distribution(mutex: int, state: Ints, rates: Floats, still: Bools, lay
 
 @compiled
 def n_choices(mutex: int, state: Ints, rates: Floats, still: Bools, layout: Layout, graphs: Graphs) -> int:
-    """How many bits of a coupling may be on, and one more for none, unless a bit is sure to be on; at least 1."""
+    """Number of possible outcomes of a mutex group: of bits that may be on, and of none unless a bit is certain; at least 1."""
     possible, sure = 0, False
     for k in range(layout.mutex_first[mutex], layout.mutex_first[mutex + 1]):
         variable = layout.mutex_members[k]
@@ -148,7 +148,7 @@ def n_choices(mutex: int, state: Ints, rates: Floats, still: Bools, layout: Layo
 
 @compiled
 def leave_out_none(chances: Floats, n: int) -> None:
-    """Takes "none", the last of ``n`` chances, for an error of the bits' rates where it is negligible beside the likeliest."""
+    """Removes "none", the last of ``n`` probabilities, if it is negligible compared with the largest: an error of the rates."""
     none, top = chances[n - 1], chances[:n].max()
     if 0.0 < none < NEGLIGIBLE * top:
         chances[n - 1] = 0.0
@@ -158,7 +158,7 @@ def leave_out_none(chances: Floats, n: int) -> None:
 
 @compiled
 def settle(state: Ints, mutex: int, chosen: int, layout: Layout) -> None:
-    """Switches the chosen bit of a coupling on and all others off; none where ``chosen`` is their number."""
+    """Switches the chosen bit of a mutex group on and all others off; all off if ``chosen`` is the number of bits."""
     first, last = layout.mutex_first[mutex], layout.mutex_first[mutex + 1]
     for k in range(last - first):
         state[layout.members[layout.first[layout.mutex_members[first + k]]]] = 1 if k == chosen else 0
@@ -166,7 +166,7 @@ def settle(state: Ints, mutex: int, chosen: int, layout: Layout) -> None:
 
 @compiled
 def which(state: Ints, mutex: int, layout: Layout) -> int:
-    """Which bit of a coupling is on; their number if none is, -1 if several are."""
+    """Which bit of a mutex group is on; the number of bits if none is, -1 if several are."""
     first, last = layout.mutex_first[mutex], layout.mutex_first[mutex + 1]
     found = last - first
     for k in range(last - first):

@@ -1,7 +1,7 @@
-"""What a cell of a stack of planes can hang on: its neighbourhood, the border, the action, and what meets what anywhere.
+"""Features of cells of planes: their neighbourhood, the border, the action, and which values are adjacent anywhere.
 
-Columns are relative, the same for every position, so that what is learned at one position holds at all: modules that are
-alike share what they know (the paper's section 5). Shapes: N transitions, C channels, P positions, D relative columns.
+Features are relative to the cell, so that parameters are tied over all positions (compare similar modules in the paper's section
+5). Shapes: N transitions, C channels, P positions, D relative features.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from mbagent_envs.jit import compiled
 _Cell = TypeVar("_Cell", bound=np.generic)
 
 CELL, BORDER, ACTION, ADJACENCY, NEXT, WRAP, NEXT_ADJACENCY = 0, 1, 2, 3, 4, 5, 6
-"""Kinds of relative columns, and what follows the kind:
+"""Kinds of relative features, and their parameters:
 
 - CELL: channel, value, rows below, columns to the right;
 - BORDER: rows below, columns to the right;
-- ACTION: number of the column, and the actions that have it on: stride, n, value, see ``encoding.action_features``;
-- ADJACENCY: channel, value, channel (``BEYOND``: what lies beyond the border), value, rows below, columns to the right; a value
-  with itself at no distance: whether it is anywhere;
-- NEXT, NEXT_ADJACENCY: a CELL and a ADJACENCY of the next state;
-- WRAP: a CELL that lies beyond the border, and so at the other end.
+- ACTION: number of the feature among those of actions, and its stride, n, value, see ``features.action_features``;
+- ADJACENCY: channel, value, channel (``BEYOND``: beyond the border), value, rows below, columns to the right; a value with itself
+  at offset (0, 0): whether it occurs anywhere;
+- NEXT, NEXT_ADJACENCY: a CELL and an ADJACENCY of the next state;
+- WRAP: a CELL beyond the border, and so at the opposite side.
 """
 
 
 class Reach(NamedTuple):
-    """How far a neighbourhood reaches.
+    """Extent of a neighbourhood.
 
     Attributes:
         radius: rows and columns in each direction.
-        wrap: whether it goes on at the other end of the board.
+        wrap: whether it continues at the opposite side of the board.
     """
 
     radius: int = 1
@@ -46,18 +46,18 @@ class Reach(NamedTuple):
 
 
 PIECE = 2000
-"""Cells whose neighbourhoods are looked at together."""
+"""Cells whose features are computed together."""
 
 NEXT_RADIUS = 2
-"""Rows and columns that a neighbourhood in the next state reaches: two places that a thing may go to lie so far apart."""
+"""Radius of neighbourhoods in the next state: twice a move by one cell, the distance of two possible next positions."""
 
 
 def relative_features(cardinalities: Sequence[int], parts: Sequence[int], reach: Reach) -> Ints:
-    """All relative columns, int64 [D, 7]; see above.
+    """All relative features, int64 [D, 7]; see above.
 
     Args:
         cardinalities: number of values of each channel's cells, length C.
-        parts: number of values of each part of an action.
+        parts: number of values of each action component.
         reach: of neighbourhoods.
     """
     near = range(-reach.radius, reach.radius + 1)
@@ -77,7 +77,7 @@ def relative_features(cardinalities: Sequence[int], parts: Sequence[int], reach:
 
 
 def _adjacencies(shown: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int, int, int, int, int]]:
-    """Two things at one place or side by side, and a thing at one of the four sides."""
+    """Pairs of values in one cell or in neighbouring cells (diagonally, too), and values at each of the four borders."""
     for i, first in enumerate(shown):
         for second in shown[i:]:
             for dy, dx in itertools.product((-1, 0, 1), (-1, 0, 1)):
@@ -88,10 +88,10 @@ def _adjacencies(shown: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int, i
 
 
 def informative_features(features: Ints, before: Factors, after: Factors) -> Ints:
-    """Numbers of the relative columns that may tell something, by what was met.
+    """Numbers of the relative features that can be informative, given the observed planes.
 
-    Values that never came tell nothing, nor do meetings of channels that only repeat another channel's past, or that are
-    the same all over the board; of the latter one cell tells all.
+    Features of values that never occurred are left out, as are adjacencies of channels that only repeat another channel's
+    previous state, or that are uniform over the board; of a uniform channel, one cell is enough.
 
     Args:
         features: int64 [D, 7].
@@ -100,28 +100,26 @@ def informative_features(features: Ints, before: Factors, after: Factors) -> Int
     """
     n_channels = before.shape[1]
     now, then = ([_values(planes[:, channel]) for channel in range(n_channels)] for planes in (before, after))
-    even = {c for c in range(n_channels) if all((p[:, c] == p[:, c, :1, :1]).all() for p in (before, after))}
+    uniform = {c for c in range(n_channels) if all((p[:, c] == p[:, c, :1, :1]).all() for p in (before, after))}
     live = {BEYOND} | {
         c
         for c in range(n_channels)
-        if c not in even and not any(_repeats(after[:, c], before[:, other]) for other in range(n_channels) if other != c)
+        if c not in uniform and not any(_repeats(after[:, c], before[:, other]) for other in range(n_channels) if other != c)
     }
 
     def known(kind: int, channel: int, value: int, other: int, second: int) -> bool:
-        positives = then if kind in (NEXT, NEXT_ADJACENCY) else now  # what ends an episode is never left again
+        values = then if kind in (NEXT, NEXT_ADJACENCY) else now  # some values occur only in terminal states
         if kind in (CELL, NEXT, WRAP):
-            return value in positives[channel] and (channel not in even or (kind != WRAP and (other, second) == (0, 0)))
+            return value in values[channel] and (channel not in uniform or (kind != WRAP and (other, second) == (0, 0)))
         if kind not in (ADJACENCY, NEXT_ADJACENCY):
             return True
-        return (
-            channel in live and other in live and value in positives[channel] and (other == BEYOND or second in positives[other])
-        )
+        return channel in live and other in live and value in values[channel] and (other == BEYOND or second in values[other])
 
     return np.flatnonzero([known(*feature[:5]) for feature in features.tolist()])
 
 
 def _values(plane: Factors) -> set[int]:
-    """Values of a plane [N, H, W]; they are few, and sorting all cells takes long."""
+    """Values of a plane [N, H, W]; testing the few values is faster than sorting all cells."""
     return {value for value in range(int(plane.max(initial=0)) + 1) if (plane == value).any()}
 
 
@@ -131,18 +129,18 @@ def _repeats(after: Factors, before: Factors) -> bool:
 
 
 def determined_by(channel: int, features: Ints, numbers: Ints, before: Factors, after: Factors, actions: Ints) -> Ints | None:
-    """Numbers of the columns that alone tell what a channel becomes everywhere: another's present values, or an action.
+    """Numbers of the features that alone determine a channel everywhere: another channel's current values, or an action.
 
     Args:
         channel: the channel.
         features: int64 [D, 7].
-        numbers: those that may be taken, int64 [K].
+        numbers: candidate features, int64 [K].
         before: planes, int [N, C, H, W].
         after: those of the next states.
         actions: int64 [N].
 
     Returns:
-        Numbers, or None where no other channel or action does.
+        Numbers, or None if no other channel or action determines the channel.
     """
     here = numbers[(features[numbers, 0] == CELL) & (features[numbers, 3:5] == 0).all(axis=1)]
     for other in np.unique(features[here, 1]):
@@ -157,19 +155,19 @@ def determined_by(channel: int, features: Ints, numbers: Ints, before: Factors, 
 
 
 def feature_values(features: Ints, planes: Factors, actions: Ints, after: Factors | None = None) -> Bools:
-    """Which columns are on for every transition and position, bool [N * P, D], positions of a transition together.
+    """Relative features of every transition and position, bool [N * P, D]; positions of a transition are contiguous.
 
     Args:
-        features: relative columns, int64 [D, 7].
+        features: relative features, int64 [D, 7].
         planes: int [N, C, H, W].
         actions: int64 [N].
-        after: the next states' planes, for columns of the kind NEXT.
+        after: the next states' planes, for features of the next state.
     """
     return np.ascontiguousarray(feature_planes(features, planes, actions, after).reshape(len(features), -1).T)
 
 
 def feature_planes(features: Ints, planes: Factors, actions: Ints, after: Factors | None = None) -> Bools:
-    """As ``feature_values``, one column after another, bool [D, N, H, W]."""
+    """As ``feature_values``, one feature after another, bool [D, N, H, W]."""
     n, _, height, width = planes.shape
     table = np.empty((len(features), n, height, width), dtype=np.bool_)
     inside = np.ones((height, width), dtype=np.bool_)
@@ -190,7 +188,7 @@ def values_at(features: Ints, planes: Factors, actions: Ints, rows: Ints, y: Int
     """As ``feature_values``, of some positions of some transitions only, bool [K, D].
 
     Args:
-        features: relative columns of this state, int64 [D, 7].
+        features: relative features of the current state, int64 [D, 7].
         planes: int [N, C, H, W].
         actions: int64 [N].
         rows: transition of each, int64 [K].
@@ -203,7 +201,7 @@ def values_at(features: Ints, planes: Factors, actions: Ints, rows: Ints, y: Int
         some = order[begin : begin + PIECE]
         observed, where = np.unique(rows[some], return_inverse=True)
         wide, part = planes[observed].astype(np.int64), np.zeros((len(some), len(features)), dtype=np.bool_)
-        _look_around(features, wide, where, y[some], x[some], part)
+        _local_values(features, wide, where, y[some], x[some], part)
         for d in np.flatnonzero(np.isin(features[:, 0], (ACTION, ADJACENCY))):
             part[:, d] = far_value(features[d], wide, actions[observed], None)[where]
         table[some] = part
@@ -211,8 +209,8 @@ def values_at(features: Ints, planes: Factors, actions: Ints, rows: Ints, y: Int
 
 
 @compiled
-def _look_around(features: Ints, planes: Ints, rows: Ints, y: Ints, x: Ints, out: Bools) -> None:
-    """The part of ``values_at`` that differs from position to position."""
+def _local_values(features: Ints, planes: Ints, rows: Ints, y: Ints, x: Ints, out: Bools) -> None:
+    """The features of ``values_at`` that depend on the position."""
     _, _, height, width = planes.shape
     for k in range(len(rows)):
         for d in range(len(features)):
@@ -237,19 +235,19 @@ def _shown(kind: int, planes: Factors, after: Factors | None) -> Factors:
 
 
 def _action_is(feature: Ints, actions: Ints) -> Bools:
-    """Whether each action [N] has a column on."""
+    """Values of an action feature, bool [N]."""
     on: Bools = actions // feature[2] % feature[3] == feature[4]
     return on
 
 
 def far_value(feature: Ints, planes: Factors, actions: Ints, after: Factors | None) -> Bools:
-    """As ``feature_values``, for a column that is the same at all positions, bool [N]."""
+    """As ``feature_values``, for a feature that is the same at all positions, bool [N]."""
     kind = int(feature[0])
     return _action_is(feature, actions) if kind == ACTION else are_adjacent(_shown(kind, planes, after), feature[1:])
 
 
 def shifted(plane: NDArray[_Cell], below: int, right: int) -> NDArray[_Cell]:
-    """What lies so many rows below and columns to the right of each position of [N, H, W]; 0 beyond the border."""
+    """Value at a fixed offset (rows below, columns to the right) from each position of [N, H, W]; 0 beyond the border."""
     _, height, width = plane.shape
     result = np.zeros_like(plane)
     rows, cols = slice(max(0, -below), min(height, height - below)), slice(max(0, -right), min(width, width - right))
@@ -260,14 +258,14 @@ def shifted(plane: NDArray[_Cell], below: int, right: int) -> NDArray[_Cell]:
 
 
 def wrapped(plane: NDArray[_Cell], below: int, right: int) -> NDArray[_Cell]:
-    """What lies beyond the border so far from each position of [N, H, W], and so at the other end; 0 where nothing is beyond."""
+    """Value at a fixed offset from each position of [N, H, W] with wrap-around; 0 if the offset stays within the border."""
     around = np.roll(plane, (-below, -right), axis=(1, 2))
     inside = shifted(np.ones((1, *plane.shape[1:]), dtype=np.bool_), below, right)
     return np.where(inside, np.zeros_like(around), around)
 
 
 def are_adjacent(planes: Factors, adjacency: Ints) -> Bools:
-    """Whether, anywhere, one channel has a value and the other has its value so far from there, bool [N]."""
+    """Whether, anywhere, one channel has a value and the other has its value at the adjacency's offset, bool [N]."""
     first, value, second, other, below, right = (int(part) for part in adjacency)
     inside = np.ones((1, *planes.shape[2:]), dtype=np.bool_)
     there = ~shifted(inside, below, right) if second == BEYOND else shifted(planes[:, second] == other, below, right)
@@ -276,7 +274,7 @@ def are_adjacent(planes: Factors, adjacency: Ints) -> Bools:
 
 
 def feature_kinds(features: Ints) -> Ints:
-    """Which kind of thing each relative column is, int64 [D]: a channel's cells (now, next), border, action, meeting."""
+    """Kind of each relative feature, int64 [D]: a channel's cells (now, next), border, action, adjacency (now, next)."""
     kind = features[:, 0]
     n_channels = int(features[kind == CELL, 1].max(initial=0)) + 1
     of_channel = np.isin(kind, (CELL, NEXT, WRAP))
@@ -285,7 +283,7 @@ def feature_kinds(features: Ints) -> Ints:
 
 
 def feature_name(feature: Ints) -> str:
-    """A relative column in words."""
+    """A relative feature in words."""
     kind, *parts = (int(part) for part in feature)
     if kind == ACTION:
         return (

@@ -1,4 +1,4 @@
-"""Dynamic Bayesian networks of planes: one decision graph for each channel, its parameters tied over all positions.
+"""Dynamic Bayesian networks of planes: one set of decision graphs for each channel, with parameters tied over all positions.
 
 Where the dynamics differ between positions, each cell has its own graph instead; held-out transitions decide.
 """
@@ -43,56 +43,56 @@ from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.types import Bools, Floats, Ints
 
 EXPECTED_TOGETHER = 12.0
-"""Two bits of a set must have been expected together this often before "never" is believed of them."""
+"""Minimum expected number of joint occurrences of two bits of a set for which having none is significant."""
 
 SOME_CELLS = 100_000
-"""Cells that are looked at for errors that go together."""
+"""Number of cells in which errors are tested for correlation."""
 
 
 def fit_channels(planes: PlaneTable) -> tuple[Graphs, list[Question], list[Search]]:
-    """Graphs of all channels, each cell for itself, and of ``terminated``."""
-    asked: list[Question] = []
-    copied_asked: list[Question] = []
-    copied: list[Search] = []
+    """Graphs of all channels without synchronic arcs, and of ``terminated``."""
+    questions: list[Question] = []
+    copy_questions: list[Question] = []
+    copies: list[Search] = []
     for channel, cardinality in enumerate(planes.cardinalities):
         features = planes.determined_by(channel)
         if features is None:
-            asked += ask(channel, cardinality, planes.observed(channel))
+            questions += ask(channel, cardinality, planes.observed(channel))
         else:
-            questions, table = planes.copying(channel, features)
-            copied_asked, copied = copied_asked + questions, copied + planes.split(questions, table, features)
-    found = planes.split(asked, planes.table, planes.near) if asked else []
-    found = refine(planes, asked, found)
-    asked, found = asked + copied_asked, found + copied
+            more, table = planes.copying(channel, features)
+            copy_questions, copies = copy_questions + more, copies + planes.split(more, table, features)
+    found = planes.split(questions, planes.table, planes.near) if questions else []
+    found = refine(planes, questions, found)
+    questions, found = questions + copy_questions, found + copies
     if planes.rows.terminated.any():
-        over, searches = _ends(planes, planes.far)
-        asked, found = asked + over, found + searches
-    return planes.build(asked, found), asked, found
+        more, searches = _ends(planes, planes.far)
+        questions, found = questions + more, found + searches
+    return planes.build(questions, found), questions, found
 
 
 def _ends(planes: PlaneTable, numbers: Ints) -> tuple[list[Question], list[Search]]:
-    """Whether episodes end, by columns that are the same at all positions."""
+    """Questions and searches for the end of episodes, with features that are the same at all positions."""
     rows, far = planes.rows, planes.far_values(numbers)
     first, pattern = distinct(np.packbits(far, axis=1))
-    nothing, ends = np.zeros(len(rows), dtype=np.int64), rows.terminated.astype(np.int64)
+    zeros, ends = np.zeros(len(rows), dtype=np.int64), rows.terminated.astype(np.int64)
     counting = np.arange(min(planes.since[-1], len(rows)), len(rows))
-    asked = ask(
+    questions = ask(
         len(planes.cardinalities),
         2,
-        Observed(pattern, planes.encoding.action_class[rows.actions], nothing, ends).select(counting),
+        Observed(pattern, planes.encoding.action_class[rows.actions], zeros, ends).select(counting),
     )
-    return asked, planes.split(asked, far[first], numbers)
+    return questions, planes.split(questions, far[first], numbers)
 
 
 def fit_synchronic(planes: PlaneTable, layout: Layout, graphs: Graphs) -> tuple[Graphs, list[Question], list[Search]]:
-    """Graphs of the channels whose cells hang on what others become, given those; and of ``terminated``.
+    """Graphs of the channels whose cells have synchronic arcs, and of ``terminated``.
 
     Args:
         planes: the transitions.
         layout: of the board.
-        graphs: of all cells, each for itself.
+        graphs: of all cells, without synchronic arcs.
     """
-    synchronic, asked, found = [], [], []
+    synchronic, all_questions, found = [], [], []
     for channel, numbers in _dependent(planes, layout, graphs).items():
         variables = layout.cells[channel].ravel()
         needed = uncertain_rows(planes.rows, layout, graphs, variables)
@@ -106,20 +106,21 @@ def fit_synchronic(planes: PlaneTable, layout: Layout, graphs: Graphs) -> tuple[
         searches = planes.split(questions, table, np.concatenate([planes.near, numbers])) if questions else []
         if any(split.feature in numbers for search in searches for split in search.splits):
             synchronic.append(channel)
-            asked += questions
+            all_questions += questions
             found += searches
     if planes.rows.terminated.any():
-        over, searches = _ends(planes, np.concatenate([planes.far, planes.next_far]))
+        questions, searches = _ends(planes, np.concatenate([planes.far, planes.next_far]))
         if any(split.feature in planes.next_far for search in searches for split in search.splits):
             synchronic.append(len(planes.cardinalities))
-            asked, found = asked + over, found + searches
+            all_questions, found = all_questions + questions, found + searches
     if not synchronic:
         return no_synchronic(graphs), [], []
-    return planes.build(asked, found)._replace(changing=np.asarray(synchronic, dtype=np.int64)), asked, found
+    built = planes.build(all_questions, found)
+    return built._replace(changing=np.asarray(synchronic, dtype=np.int64)), all_questions, found
 
 
 def _dependent(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[int, Ints]:
-    """For each channel, numbers of the columns of the kind NEXT whose errors go with those of its cells."""
+    """For each channel, numbers of the features of kind ``NEXT`` whose errors are correlated with those of its cells."""
     errors = _errors(planes, layout, graphs)
     found: dict[int, Ints] = {}
     for channel in sorted({c for c, _ in errors}):
@@ -138,12 +139,12 @@ def _dependent(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[int, 
 
 
 def _is_earlier(feature: Ints, channel: int) -> bool:
-    """Whether a cell of the next state is drawn before those of the channel at the same place."""
+    """Whether a feature's cell of the next state is drawn before the channel's cell that the feature is relative to."""
     return bool(feature[1] < channel or (feature[1] == channel and tuple(feature[3:5]) < (0, 0)))
 
 
 def _errors(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[tuple[int, int], tuple[Floats, Floats]]:
-    """Errors and their variances, [n, H, W] each, of every (channel, value) that is uncertain, in some rows."""
+    """Errors and their variances, [n, H, W] each, of every uncertain (channel, value) in n of the rows."""
     if len(planes.rows) == 0:
         return {}
     n = min(max(100, SOME_CELLS // planes.n_cells), len(planes.rows))
@@ -156,26 +157,26 @@ def _errors(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[tuple[in
     sampling.marginals(rows.states, rows.actions, layout, graphs, start, probs)
     found = {}
     for channel, k in enumerate(planes.cardinalities):
-        alone = layout.mutex_of[layout.cells[channel]] < 0
+        ungrouped = layout.mutex_of[layout.cells[channel]] < 0
         for value in range(k) if k > 2 else (1,):
             p = probs[:, start[layout.cells[channel]] + value]
-            spread = p * (1.0 - p) * alone
+            spread = p * (1.0 - p) * ungrouped
             if spread.sum() > UNCERTAIN:
-                found[channel, value] = ((planes.after[some, channel] == value) - p) * alone, spread
+                found[channel, value] = ((planes.after[some, channel] == value) - p) * ungrouped, spread
     return found
 
 
 def find_mutexes(
     rows: TransitionBatch, board: PlaneLayout, cardinalities: tuple[int, ...], some: TransitionBatch, ones: Floats
 ) -> tuple[Mutex, ...]:
-    """Sets of cells that are coupled: whole channels of which one cell is on, or lines of which two are never on.
+    """Mutex groups of cells: channels with exactly one cell on, and channels, rows or columns with never more than one on.
 
     Args:
         rows: all transitions.
-        board: where cells lie.
+        board: positions of the cells.
         cardinalities: number of values of each channel's cells.
-        some: a few of the transitions.
-        ones: each cell's probability to be on after those, [n, C, H, W].
+        some: a sample of n transitions.
+        ones: predicted probability of each cell to be on after those, [n, C, H, W].
     """
     if len(rows) == 0:
         return ()
@@ -190,8 +191,8 @@ def find_mutexes(
             p = ones[:, channel]
             total, squares = p.sum(axis=axis).reshape(len(p), -1), (p**2).sum(axis=axis).reshape(len(p), -1)
             expected = (total**2 - squares).sum(axis=0) / 2.0 * (len(rows) / max(len(some), 1))
-            alone = after[:, channel].sum(axis=axis, dtype=np.int64).reshape(len(rows), -1).max(axis=0, initial=0) <= 1
-            for i in np.flatnonzero(alone & (expected > EXPECTED_TOGETHER)):
+            exclusive = after[:, channel].sum(axis=axis, dtype=np.int64).reshape(len(rows), -1).max(axis=0, initial=0) <= 1
+            for i in np.flatnonzero(exclusive & (expected > EXPECTED_TOGETHER)):
                 line = int(i) if i < (length + 1) // 2 else int(i) - length
                 found.append((float(expected[i]), Mutex(channel, kind, line, False)))
     found.sort(key=lambda entry: -entry[0])
@@ -199,20 +200,20 @@ def find_mutexes(
 
 
 SIMULATED_STEPS = 5
-"""Steps of imagined play that show which laws would be broken."""
+"""Simulated steps in which it is tested which invariants the model would violate."""
 
 LARGEST_RADIUS = 3
-"""Neighbourhoods are tried up to this radius."""
+"""Largest radius of neighbourhoods that is tried."""
 
 
 class LocalGraphModel(DecisionGraphModel):
-    """Decision graphs over each cell's neighbourhood, the same at all positions, and over what meets what anywhere.
+    """Decision graphs over each cell's neighbourhood and adjacency features, with parameters tied over all positions.
 
     Args:
-        space: a stack of planes; all cells of a channel have equally many values.
+        space: a stack of planes; all cells of a channel have the same number of values.
         n_actions: number of enumerated actions A.
-        reach: how far a neighbourhood reaches; None to find out from held-out episodes.
-        validation: share of episodes held out for the report; the graphs are fitted to all rows in the end.
+        reach: extent of neighbourhoods; None to choose it on held-out episodes.
+        validation: share of episodes held out, for the report and for choices; the final graphs are fitted to all rows.
         parts: see DecisionGraphModel.
 
     Raises:
@@ -232,36 +233,36 @@ class LocalGraphModel(DecisionGraphModel):
         cards = None if space.planes is None else channel_cardinalities(space)
         if space.planes is None or cards is None:
             raise ValueError(
-                f"LocalGraphModel needs planes whose cells have equally many values in each channel, got {space.space}; "
+                f"LocalGraphModel needs planes whose cells have the same number of values in each channel, got {space.space}; "
                 "use DecisionGraphModel."
             )
         self.board, self.given, self.searched = space.planes, reach, 0
         self.counted = 0
-        self._forget(cards, reach or Reach())
+        self._clear(cards, reach or Reach())
 
-    def _forget(self, cards: tuple[int, ...], reach: Reach) -> None:
-        """Knows nothing, but how far neighbourhoods reach."""
+    def _clear(self, cards: tuple[int, ...], reach: Reach) -> None:
+        """Sets an unfitted model with the given reach."""
         self.reach = reach
         features = relative_features(cards, self.parts, reach)
         none = np.zeros(0, dtype=np.int64)
-        nothing = [smoothing_of(k, self.encoding.n_action_classes, none, none, none) for k in (*cards, 2, 2)]
-        graphs = build(channel_layout(cards, self.encoding), (), (), nothing, 1e-9)
+        smoothings = [smoothing_of(k, self.encoding.n_action_classes, none, none, none) for k in (*cards, 2, 2)]
+        graphs = build(channel_layout(cards, self.encoding), (), (), smoothings, 1e-9)
         self.local = LocalGraphs(graphs, no_synchronic(graphs), features, cards, self.encoding, ())
         self._instantiate((), ())
 
-    def _instantiate(self, asked: tuple[Question, ...], found: tuple[Search, ...]) -> None:
+    def _instantiate(self, questions: tuple[Question, ...], found: tuple[Search, ...]) -> None:
         layout, graphs, synchronic = instantiate(self.local, self.board)
-        self.fitted = Fitted(layout, graphs, synchronic, graphs, False, asked, found)
+        self.fitted = Fitted(layout, graphs, synchronic, graphs, False, questions, found)
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel."""
         began = time.perf_counter()
         rows = data.rows()
-        self._forget(self.local.cardinalities, self.given or self._best_reach(*data.split(self.validation, seed)))
+        self._clear(self.local.cardinalities, self.given or self._best_reach(*data.split(self.validation, seed)))
         since = self._since(rows, np.zeros(len(rows), dtype=np.bool_))
         train, held_out, train_since = self._split(data, seed, since)
         self._learn(train, since=train_since)
-        likelihood, jointly = self._jointly(held_out)
+        likelihood, jointly = self._compare_synchronic(held_out)
         if progress is not None:
             progress(0.5)
         exact, (variables, calibration) = self._exact_match(held_out), self._described(held_out)
@@ -278,7 +279,7 @@ class LocalGraphModel(DecisionGraphModel):
         return replace(report, seconds=time.perf_counter() - began)
 
     def _variables(self) -> list[Variable]:
-        """Channels; their parents are relative columns."""
+        """Channels; their parents are relative features."""
         channels = [int(c) for c in self.local.graphs.changing if c < len(self.local.cardinalities)]
         found = []
         for channel in channels:
@@ -298,68 +299,68 @@ class LocalGraphModel(DecisionGraphModel):
         return LocalGraphModel(space, self.n_actions, self.reach, parts=self.parts)
 
     def _since(self, rows: TransitionBatch, resets: Bools) -> Ints:
-        """First row that tells of each channel, and of ``terminated``, as it is now."""
+        """First row from which the present rules of each channel and of ``terminated`` hold, int64 [C + 1]."""
         return last_changes(rows, len(self.local.cardinalities) + 1, self._channel_log_probs)
 
     def _channel_log_probs(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
-        """As for factors, summed over each channel, [T, C + 1]."""
+        """Log-probabilities as for factors, summed over each channel, [T, C + 1]."""
         each = self._factor_log_probs(train, tests)
         cells = self.board.to_planes(each[:, :-1]).sum(axis=(2, 3))
         return np.concatenate([cells, each[:, -1:]], axis=1)
 
-    def _look(self, rows: TransitionBatch) -> None:
-        """Learns quickly."""
+    def _fit_quickly(self, rows: TransitionBatch) -> None:
+        """Fits without synchronic arcs and pairwise splits."""
         self._learn(rows, jointly=False, in_pairs=False)
 
-    def _kept(self) -> Any:
+    def _snapshot(self) -> Any:
         return self.local, self.fitted, self.reach
 
-    def _restore(self, kept: Any) -> None:
-        self.local, self.fitted, self.reach = kept
+    def _restore(self, snapshot: Any) -> None:
+        self.local, self.fitted, self.reach = snapshot
 
     def _best_reach(self, train: TransitionBatch, held_out: TransitionBatch) -> Reach:
-        """The least reach under which held-out transitions are foretold no worse than under larger ones; from some rows."""
+        """The smallest reach beyond which held-out likelihood does not improve; from a sample of rows."""
         if len(held_out) == 0:
             return Reach()
         some, tests = thinned(train, SOME_ROWS), thinned(held_out, SOME_TESTS)
-        best, logs = Reach(), self._reaching(Reach(), some, tests)
+        best, logs = Reach(), self._reach_log_probs(Reach(), some, tests)
         most = min(LARGEST_RADIUS, max(self.board.height, self.board.width) // 2)
         while best.radius < most and logs.mean() < FORETOLD:
-            further = self._reaching(Reach(best.radius + 1), some, tests)
+            further = self._reach_log_probs(Reach(best.radius + 1), some, tests)
             if not better(further, logs):
                 break
             best, logs = Reach(best.radius + 1), further
-        if logs.mean() < FORETOLD and better(self._reaching(best._replace(wrap=True), some, tests), logs):
+        if logs.mean() < FORETOLD and better(self._reach_log_probs(best._replace(wrap=True), some, tests), logs):
             best = best._replace(wrap=True)
         return best
 
-    def _reaching(self, reach: Reach, train: TransitionBatch, tests: TransitionBatch) -> Floats:
-        """Log-probabilities of transitions after learning from others."""
-        self._forget(self.local.cardinalities, reach)
+    def _reach_log_probs(self, reach: Reach, train: TransitionBatch, tests: TransitionBatch) -> Floats:
+        """Log-probabilities of transitions after a quick fit to others with the given reach."""
+        self._clear(self.local.cardinalities, reach)
         return self._quick_log_probs(train, tests)
 
     def _learn(self, rows: TransitionBatch, jointly: bool = True, since: Ints | None = None, in_pairs: bool = True) -> None:
-        """Graphs first, each cell for itself; then what is never on together, and what hangs on what others become."""
+        """Fits graphs of all cells, then mutex groups, then synchronic arcs (if ``jointly``)."""
         local = self.local
         planes = PlaneTable(rows, self.board, local.cardinalities, local.features, self.encoding, since, in_pairs)
         self.searched, self.counted = len(planes.rows), len(planes.every_action)
-        graphs, asked, found = fit_channels(planes)
+        graphs, questions, found = fit_channels(planes)
         self.local = replace(local, graphs=graphs, synchronic=no_synchronic(graphs), mutexes=(), invariants=NO_INVARIANTS)
         self._instantiate((), ())
         some = thinned(rows, SOME_ROWS)
         mutexes = find_mutexes(rows, self.board, local.cardinalities, some, self._ones(some))
         self.local = replace(self.local, mutexes=mutexes)
         layout = with_mutexes(self.fitted.layout, mutexes)
-        self.fitted = replace(self.fitted, layout=layout, asked=tuple(asked), found=tuple(found))
+        self.fitted = replace(self.fitted, layout=layout, asked=tuple(questions), found=tuple(found))
         if not jointly:
             return
-        synchronic, more_asked, more_found = fit_synchronic(planes, layout, self.fitted.usual)
+        synchronic, more_questions, more_found = fit_synchronic(planes, layout, self.fitted.usual)
         if len(synchronic.changing):
             self.local = replace(self.local, synchronic=synchronic)
-            self._instantiate((*asked, *more_asked), (*found, *more_found))
+            self._instantiate((*questions, *more_questions), (*found, *more_found))
 
     def _enforce_invariants(self, rows: TransitionBatch) -> None:
-        """Keeps to laws of the transitions that imagined play would break."""
+        """Enforces the invariants of the transitions that the model's own samples would violate."""
         invariants, layout, rng = (
             find_invariants(rows, self.board, self.local.cardinalities),
             self.fitted.layout,
@@ -367,13 +368,13 @@ class LocalGraphModel(DecisionGraphModel):
         )
         each = [*(NO_INVARIANTS._replace(counts=invariants.counts[k : k + 1]) for k in range(len(invariants.counts)))]
         each += [NO_INVARIANTS._replace(observed=invariants.observed)]
-        broken, states = np.zeros(len(each), dtype=np.bool_), thinned(rows, SOME_ROWS).states
+        violated, states = np.zeros(len(each), dtype=np.bool_), thinned(rows, SOME_ROWS).states
         for _ in range(0 if invariants.none else SIMULATED_STEPS):
             following, over = self.sample(states, rng.integers(self.n_actions, size=len(states)), rng)
             for i, invariant in enumerate(each):
-                broken[i] |= not (over | all_kept(*invariant, layout.weights, layout.cells, states, following)).all()
+                violated[i] |= not (over | all_kept(*invariant, layout.weights, layout.cells, states, following)).all()
             states = following[~over]
-        invariants = Invariants(invariants.counts[broken[:-1]], invariants.observed if broken[-1] else NO_INVARIANTS.observed)
+        invariants = Invariants(invariants.counts[violated[:-1]], invariants.observed if violated[-1] else NO_INVARIANTS.observed)
         self.local = replace(self.local, invariants=invariants)
         self.fitted = replace(self.fitted, layout=with_invariants(layout, invariants))
 
@@ -383,22 +384,22 @@ class LocalGraphModel(DecisionGraphModel):
         return self.board.to_planes(self.marginals(rows.states, rows.actions)[:, start + 1])
 
     def for_space(self, space: FactoredSpace | spaces.Space[Any]) -> LocalGraphModel:
-        """The same knowledge for planes of another size; nothing is learned anew.
+        """This model for planes of another size, without another fit.
 
         Args:
             space: a stack of planes, as a Gymnasium space or factored.
 
         Raises:
-            ValueError: it is no stack of planes, or the channels or their values are others.
+            ValueError: it is no stack of planes, or the channels or their numbers of values differ.
         """
         space = space if isinstance(space, FactoredSpace) else FactoredSpace(space)
         if space.planes is None:
-            raise ValueError(f"for_space carries knowledge of planes over to planes of another size, but got {space.space}.")
+            raise ValueError(f"for_space transfers a model to planes of another size, but got {space.space}.")
         other = LocalGraphModel(space, self.n_actions, self.given, self.validation, self.parts)
         if other.local.cardinalities != self.local.cardinalities:
             raise ValueError(
-                f"This model knows channels with {self.local.cardinalities} values, but {space.space} has "
-                f"{other.local.cardinalities}; only the rows and columns may be others."
+                f"This model has channels with {self.local.cardinalities} values, but {space.space} has "
+                f"{other.local.cardinalities}; only the rows and columns may differ."
             )
         other.local, other.reach = self.local, self.reach
         other._instantiate((), ())
@@ -425,7 +426,7 @@ class LocalGraphModel(DecisionGraphModel):
             raise ValueError(f"These weights are not those of local decision graphs (first difference: {wrong[0]!r}).")
         cards, parts = self.local.cardinalities, np.asarray(state["reach"]).reshape(-1)
         if len(parts) != 2 or parts[0] not in range(1, LARGEST_RADIUS + 1) or parts[1] not in (0, 1):
-            raise ValueError("These weights are of neighbourhoods that reach as far as none can; the file is damaged.")
+            raise ValueError("These weights have neighbourhoods with an invalid radius or wrap-around; the file is damaged.")
         reach = Reach(int(parts[0]), bool(parts[1]))
         features = relative_features(cards, self.parts, reach)
         graphs, synchronic = (
@@ -437,25 +438,25 @@ class LocalGraphModel(DecisionGraphModel):
             for name in ("local", "late")
         )
         if not _sound(graphs, synchronic, features):
-            raise ValueError("These weights ask for a next state that is not known yet; load them as they were saved.")
+            raise ValueError("These weights have graphs that test values not yet drawn; load them as they were saved.")
         mutexes = tuple(Mutex(int(c), int(k), int(i), bool(e)) for c, k, i, e in table_of(state["couplings"], 4))
         height, width = self.board.height, self.board.width
         if any(
             c.channel not in range(len(cards)) or cards[c.channel] != 2 or c.kind not in (0, 1, 2) or not c.lies_on(height, width)
             for c in mutexes
         ):
-            raise ValueError("These weights couple cells that these planes do not have; load them into a model of the same kind.")
+            raise ValueError("These weights have mutex groups that these planes do not have; load them into a similar model.")
         invariants = Invariants(table_of(state["counts"], 2), np.array(state["met"], dtype=np.bool_).reshape(-1))
         if any(c not in range(len(cards)) or value not in range(cards[c]) for c, value in invariants.counts) or (
             len(invariants.observed) not in (0, n_combinations(cards))
         ):
-            raise ValueError("These weights count values that these planes do not have; load them into a model of the same kind.")
+            raise ValueError("These weights have invariants that these planes do not have; load them into a similar model.")
         self.local, self.reach = LocalGraphs(graphs, synchronic, features, cards, self.encoding, mutexes, invariants), reach
         self._instantiate((), ())
 
 
 def channel_cardinalities(space: FactoredSpace) -> tuple[int, ...] | None:
-    """Number of values of each channel's cells, or None where they differ within a channel."""
+    """Number of values of each channel's cells, or None if they differ within a channel."""
     assert space.planes is not None
     cells = space.planes.to_planes(np.asarray(space.cardinalities)[None])[0]
     alike = (cells == cells[:, :1, :1]).all()
@@ -463,25 +464,25 @@ def channel_cardinalities(space: FactoredSpace) -> tuple[int, ...] | None:
 
 
 def _sound(graphs: Graphs, synchronic: Graphs, features: Ints) -> bool:
-    """Whether only late graphs ask for the next state."""
-    asked = graphs.feature[graphs.feature >= 0]
+    """Whether only synchronic graphs test the next state."""
+    tested = graphs.feature[graphs.feature >= 0]
     channels = features[features[:, 0] == NEXT, 1]
     return bool(
-        not np.isin(features[asked, 0], (NEXT, NEXT_ADJACENCY)).any() and (synchronic.changing <= channels.max() + 1).all()
+        not np.isin(features[tested, 0], (NEXT, NEXT_ADJACENCY)).any() and (synchronic.changing <= channels.max() + 1).all()
     )
 
 
 MOST_UNTIED_CELLS = 2000
-"""Cells of planes of which each is looked at for itself; with more, no rows would be enough."""
+"""Maximum number of cells for which a model without tied parameters is tried; with more, it would need too many rows."""
 
 
 class PlaneGraphModel(LocalGraphModel):
-    """A LocalGraphModel that learns each cell for itself where that foretells held-out transitions clearly better.
+    """A LocalGraphModel that uses graphs for each single cell if these predict held-out transitions clearly better.
 
-    So it is where planes only write down a place, and what an action does there is another thing at each.
+    This happens where planes merely encode a position and dynamics differ between positions.
 
     Attributes:
-        flat: the model of each cell for itself, whose graphs are this one's then; else None.
+        flat: the model without tied parameters, whose graphs this model then uses; else None.
     """
 
     flat: DecisionGraphModel | None = None
@@ -492,7 +493,7 @@ class PlaneGraphModel(LocalGraphModel):
         report = super().fit(data, seed=seed, progress=progress)
         train, held_out = self._parts
         del self._parts
-        recent = _later_half(train), _later_half(held_out)  # what hung on the place may have changed unseen by one rule for all
+        recent = _later_half(train), _later_half(held_out)  # tied graphs may miss a change of rules that depend on the position
         if any(self._depends_on_position(*parts, report.predictor_loss) for parts in ((train, held_out), recent)):
             flat = DecisionGraphModel(self.cardinalities, self.n_actions, self.validation, self.parts)
             other = flat.fit(data, seed=seed)
@@ -505,18 +506,18 @@ class PlaneGraphModel(LocalGraphModel):
         self.flat, self.fitted = flat, flat.fitted
 
     def _split(self, data: TransitionDataset, seed: int, since: Ints) -> tuple[TransitionBatch, TransitionBatch, Ints]:
-        """As always; the parts are kept until the fit ends, so that either model is judged by the same transitions."""
+        """As in the base class; both parts are kept until the fit ends, so that both models are compared on the same rows."""
         train, held_out, train_since = super()._split(data, seed, since)
-        self._parts = train.select(np.arange(train_since.max(), len(train))), held_out  # as the rules are now
+        self._parts = train.select(np.arange(train_since.max(), len(train))), held_out  # only rows of the present rules
         return train, held_out, train_since
 
     def _depends_on_position(self, train: TransitionBatch, held_out: TransitionBatch, loss: float | None) -> bool:
-        """Whether a quick look at each cell for itself foretells held-out transitions better than what was learned of all.
+        """Whether a quick fit without tied parameters predicts held-out transitions better than the tied model.
 
         Args:
-            train: transitions to learn from.
-            held_out: those held out.
-            loss: what held-out transitions cost the model of all positions, nats each; None where none was held out.
+            train: training transitions.
+            held_out: held-out transitions.
+            loss: mean held-out loss of the tied model, in nats; None if no transitions were held out.
         """
         some, tests = thinned(train, SOME_ROWS), thinned(held_out, SOME_TESTS)
         if loss is None or loss < -FORETOLD or len(self.cardinalities) > MOST_UNTIED_CELLS or min(len(some), len(tests)) < 2:
@@ -530,11 +531,11 @@ class PlaneGraphModel(LocalGraphModel):
         """See LocalGraphModel.
 
         Raises:
-            ValueError: also where rules hang on the place.
+            ValueError: also if the dynamics depend on the position.
         """
         if self.flat is not None:
             raise ValueError(
-                "What this model learned hangs on the place on the planes, so planes of another size are unknown to it."
+                "The learned dynamics depend on the position on the planes, so they do not apply to planes of another size."
             )
         return super().for_space(space)
 
@@ -562,5 +563,5 @@ def _later_half(rows: TransitionBatch) -> TransitionBatch:
 
 
 def _loss(report: FitReport) -> float:
-    """What held-out transitions cost, nats each; of none, infinitely much."""
+    """Mean held-out loss in nats; infinite without held-out transitions."""
     return float("inf") if report.predictor_loss is None else report.predictor_loss

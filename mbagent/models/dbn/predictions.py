@@ -1,4 +1,4 @@
-"""What decision graphs foretell: draws, probabilities and successors, all exact."""
+"""Predictions of decision graphs: samples, exact probabilities and successors."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from mbagent.types import Actions, Bools, Floats, Ints, Keys, Randomness, States
 from mbagent_envs.random_keys import derive, uniforms
 
 _RESET = 1 << 33
-"""Salt of the random number that decides whether the event happens."""
+"""Salt of the random number that decides whether a reset happens."""
 
 _AGAIN = 1 << 34
 """Salt of the random numbers of the first repeated draw."""
 
 
 class GraphPredictions(BaseTransitionModel):
-    """The part of a model that reads graphs, however they were found.
+    """Predictions of a model from its fitted graphs.
 
     Attributes:
         fitted: the graphs.
@@ -35,7 +35,7 @@ class GraphPredictions(BaseTransitionModel):
     _kernel: tuple[Fitted, AffectedIndex | WholeKernel] | None = None
 
     def kernel(self) -> AffectedIndex | WholeKernel:
-        """The graphs for compiled search, see ``compiled_model.py``."""
+        """The graphs for compiled search, see ``models/overloads.py``."""
         if self._kernel is None or self._kernel[0] is not self.fitted:
             self._kernel = self.fitted, kernel_of(self._for_planning(), self.cardinalities)
         return self._kernel[1]
@@ -51,7 +51,7 @@ class GraphPredictions(BaseTransitionModel):
 
     @property
     def _cells(self) -> tuple[Ints, Ints]:
-        """What the laws are about: see ``invariants.keeps``."""
+        """Weights and cells of the invariants: see ``invariants.keeps``."""
         return self.fitted.layout.weights, self.fitted.layout.cells
 
     def _rows(self, states: States, actions: Actions) -> tuple[States, Actions]:
@@ -83,7 +83,7 @@ class GraphPredictions(BaseTransitionModel):
         return following, over
 
     def _draw(self, states: States, actions: Actions, keys: Keys, greedy: bool = False) -> tuple[States, Bools]:
-        """Draws by keys, or takes the likeliest value of each unit."""
+        """Draws by keys, or takes the most probable value of each variable."""
         fitted, following, over = self.fitted, states.copy(), np.zeros(len(states), dtype=np.bool_)
         sampling.sample(states, actions, keys, greedy, fitted.layout, fitted.usual, fitted.synchronic, following, over)
         uniform = 0.5 if greedy else uniforms(derive(keys, _RESET), 1)[:, 0]
@@ -97,12 +97,12 @@ class GraphPredictions(BaseTransitionModel):
         return following, over
 
     def likeliest(self, states: States, actions: Actions) -> tuple[States, Bools]:
-        """The likeliest next states, unit by unit, int64 [B, F], and whether they end the episode, bool [B]."""
+        """The most probable next states, variable by variable, int64 [B, F], and whether they end the episode, bool [B]."""
         states, actions = self._rows(states, actions)
         return self._draw(states, actions, np.zeros(len(states), dtype=np.uint64), greedy=True)
 
     def marginals(self, states: States, actions: Actions) -> Floats:
-        """See TransitionModel; of a factor that is drawn after others, given what these become, as learned of it by itself."""
+        """See TransitionModel; the marginals of variables with synchronic arcs are those learned without these arcs."""
         states, actions = self._rows(states, actions)
         start = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64)
         fitted, probs = self.fitted, np.empty((len(states), int(start[-1])))
@@ -116,7 +116,7 @@ class GraphPredictions(BaseTransitionModel):
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
         """See TransitionModel; exact for the distribution that ``sample`` draws from.
 
-        Where there are laws (see ``invariants.py``), the chance that all are kept is estimated from systematic draws.
+        If there are invariants (see ``invariants.py``), the probability that all of them hold is estimated from systematic draws.
         """
         states, actions = self._rows(states, actions)
         following, over = np.ascontiguousarray(next_states, dtype=np.int64), np.ascontiguousarray(terminated, dtype=np.bool_)
@@ -136,7 +136,7 @@ class GraphPredictions(BaseTransitionModel):
             return np.logaddexp(np.log1p(-rate) + usual, np.log(rate) + reset)
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
-        """See TransitionModel; see ``models/particles.py``."""
+        """See TransitionModel and ``models/systematic_sampling.py``."""
         states, actions = self._rows(states, actions)
         planned = self._for_planning()
         if not self.fitted.has_reset:

@@ -1,8 +1,8 @@
-"""Which class a whole transition is of, such as which reward it earned, by decision graphs over all that it shows.
+"""Decision graphs that classify transitions, such as by their reward, from state, action and next state.
 
-Each class but the commonest has a graph of its own for whether a transition is of it. Graphs ask for the values of single factors
-before and after the step, for the action, and, on planes, for what meets what anywhere. Columns are looked at only when a
-graph asks for them. Shapes: B rows, F factors, C channels, D columns, J graphs, K classes, W ways of actions.
+Each class but the most frequent has a graph that predicts whether a transition belongs to it. Graphs test single factors before
+and after the step, the action, and, on planes, adjacencies anywhere. Features are evaluated only when a graph tests them.
+Shapes: B rows, F factors, C channels, D features, J graphs, K classes, W action classes.
 """
 
 from __future__ import annotations
@@ -33,30 +33,32 @@ from mbagent.types import Bools, Floats, Ints
 from mbagent_envs.jit import compiled, inlined
 
 SHOWN, NEXT_SHOWN, ACTION_PART, MEETS, NEXT_MEETS = range(5)
-"""Kinds of features: a factor's value lies in a range, now or next; an action has it; see ``features.Layout.adjacencies``."""
+"""Kinds of features: a factor's value in a range, now or next; a feature of actions; an adjacency, now or next, see
+``features.Layout``."""
 
 MOST_REWARD_ENTRIES = 50_000_000
-"""Rows times columns that are searched; of more rows, all of rare classes and evenly chosen others are, up to half each."""
+"""Maximum number of rows times features of a search; of more rows, a sample: those of rare classes, up to one half, and others,
+evenly spaced."""
 
 MOST_SINGLE = 4000
-"""On planes with more columns of single cells than that, only what meets what is asked for."""
+"""Maximum number of features of single cells on planes; with more, only actions and adjacencies are used."""
 
 
 SAVED_CLASSES = ("columns", "cells", "ways", "acts", "classes", "first", "node", "rate")
-"""Names in files of the fields of ClassGraphs, in their order."""
+"""Names in files of the fields of ``ClassGraphs``, in their order."""
 
 
 class ClassGraphs(NamedTuple):
     """The graphs, as arrays.
 
     Attributes:
-        features: kind and up to six parts, int64 [D, 7].
+        features: kind and up to six parameters, int64 [D, 7].
         cells: factor of each channel's cells, int64 [C, H, W]; empty without planes.
-        action_classes: the number under which each action is counted, int64 [A].
-        encoding: which action columns are on, bool [A, columns].
+        action_classes: action class of each action, int64 [A].
+        encoding: features of actions, bool [A, features].
         classes: class of each graph, int64 [J].
-        first: first node of each graph and way, -1 where the class never came under it, int64 [J, W].
-        node: column (-1 at a leaf), and the next node where it is off and on, int64 [nodes, 3]; those come before.
+        first: first node for each graph and action class, -1 if the class was never observed under it, int64 [J, W].
+        node: feature (-1 at a leaf), and the next node if it is off and on, int64 [nodes, 3]; next nodes have smaller numbers.
         rate: probability of the class at a leaf, [nodes].
     """
 
@@ -73,14 +75,14 @@ class ClassGraphs(NamedTuple):
 def fit_classes(
     rows: TransitionBatch, classes: Ints, cardinalities: Sequence[int], parts: Sequence[int], planes: PlaneLayout | None
 ) -> ClassGraphs:
-    """Learns what the class of a transition hangs on.
+    """Fits decision graphs that predict the class of a transition.
 
     Args:
         rows: N transitions.
-        classes: class of each, int64 [N]; 0 is the commonest.
+        classes: class of each, int64 [N]; 0 is the most frequent.
         cardinalities: number of values of each factor, length F.
-        parts: number of values of each part of an action.
-        planes: where cells lie, where factors form planes.
+        parts: number of values of each action component.
+        planes: positions of the cells, if factors form planes.
     """
     encoding, layout = action_encoding(parts), make_layout(cardinalities, (), action_encoding(parts), ordinal=planes is None)
     candidates = _candidates(rows, layout, cardinalities, parts, planes)
@@ -88,15 +90,15 @@ def fit_classes(
     some, kinds = rows.select(chosen), _kinds(rows, layout, candidates)
     first, pattern = distinct(np.packbits(_values(some, layout, candidates, planes), axis=1), some.actions)
     table = _values(some.select(first), layout, candidates, planes)
-    nothing, nodes = np.zeros(len(some), dtype=np.int64), Nodes()
+    zeros, nodes = np.zeros(len(some), dtype=np.int64), Nodes()
     present = [int(k) for k in np.unique(classes) if k > 0]
-    asked = [
-        ask(0, 2, Observed(pattern, encoding.action_class[some.actions], nothing, (classes[chosen] == k).astype(np.int64)))[0]
+    questions = [
+        ask(0, 2, Observed(pattern, encoding.action_class[some.actions], zeros, (classes[chosen] == k).astype(np.int64)))[0]
         for k in present
     ]
-    found = find_splits([question.target for question in asked], table, kinds, encoding.n_action_classes)
-    begins = np.full((len(asked), encoding.n_action_classes), -1, dtype=np.int64)
-    for j, (question, search) in enumerate(zip(asked, found, strict=True)):
+    found = find_splits([question.target for question in questions], table, kinds, encoding.n_action_classes)
+    begins = np.full((len(questions), encoding.n_action_classes), -1, dtype=np.int64)
+    for j, (question, search) in enumerate(zip(questions, found, strict=True)):
         begins[j, question.pairs // 2] = nodes.graph(search, best_prior(found))
     links = np.asarray(nodes.links, dtype=np.int64).reshape(-1, 3)
     used, number = np.unique(links[:, 0][links[:, 0] >= 0], return_inverse=True)
@@ -122,7 +124,7 @@ def _rates(nodes: Nodes) -> Floats:
 
 
 def _chosen(classes: Ints, most: int) -> Ints:
-    """Numbers of the rows that are searched."""
+    """Numbers of at most ``most`` rows for the search."""
     if len(classes) <= most:
         return np.arange(len(classes))
     rare, common = np.flatnonzero(classes > 0), np.flatnonzero(classes == 0)
@@ -135,7 +137,7 @@ def _chosen(classes: Ints, most: int) -> Ints:
 def _candidates(
     rows: TransitionBatch, layout: Layout, cardinalities: Sequence[int], parts: Sequence[int], planes: PlaneLayout | None
 ) -> Ints:
-    """Columns that may tell something, int64 [D, 7]."""
+    """Features that can be informative, int64 [D, 7]."""
     single = np.zeros((len(layout.factor), 7), dtype=np.int64)
     single[:, 1:4] = np.stack([layout.factor, layout.value, layout.top], axis=1)
     encoding = np.zeros((layout.encoding.n_features, 7), dtype=np.int64)
@@ -155,14 +157,14 @@ def _candidates(
 
 
 def _varying(features: Ints, states: NDArray[Any]) -> Ints:
-    """Those columns whose factor is not the same everywhere."""
+    """The features whose factor has more than one value in the given states."""
     varies = (states != states[:1]).any(axis=0)
     determined: Ints = features[varies[features[:, 1]]]
     return determined
 
 
 def _kinds(rows: TransitionBatch, layout: Layout, candidates: Ints) -> Ints:
-    """Kind of each column: causes of one kind make others of that kind likelier, see ``find_splits``."""
+    """Kind of each feature, int64 [D]: splits by one kind make others of that kind more probable, see ``find_splits``."""
     of_single = feature_kinds(layout, rows.before, (rows.before != rows.after).any(axis=0))
     number = {tuple(key): i for i, key in enumerate(np.stack([layout.factor, layout.value, layout.top], axis=1).tolist())}
     most, kinds = int(of_single.max(initial=0)) + 1, np.empty(len(candidates), dtype=np.int64)
@@ -173,7 +175,7 @@ def _kinds(rows: TransitionBatch, layout: Layout, candidates: Ints) -> Ints:
 
 
 def _values(rows: TransitionBatch, layout: Layout, candidates: Ints, planes: PlaneLayout | None) -> Bools:
-    """Which columns are on, bool [N, D]."""
+    """Values of the candidate features, bool [N, D]."""
     table, kind = np.empty((len(rows), len(candidates)), dtype=np.bool_), candidates[:, 0]
     for which, states in ((SHOWN, rows.before), (NEXT_SHOWN, rows.after)):
         here = np.flatnonzero(kind == which)
@@ -190,7 +192,7 @@ def _values(rows: TransitionBatch, layout: Layout, candidates: Ints, planes: Pla
 
 
 def _counted(graphs: ClassGraphs, rows: TransitionBatch, classes: Ints) -> Floats:
-    """Rates at the leaves as they are over all rows, whichever were searched."""
+    """Rates at the leaves, estimated from all rows and not only from those of the search."""
     rates = graphs.rate.copy()
     for j, k in enumerate(graphs.classes):
         parts = [leaves_of(graphs, j, part.states, part.actions, part.next_states) for part in rows.parts(10_000)]
@@ -214,7 +216,7 @@ def _leaf(
     encoding: Bools,
     nodes: Ints,
 ) -> int:
-    """The leaf that a transition leads to from a node on, or -1. Takes arrays: to have them from a tuple each time costs more."""
+    """The leaf that a transition leads to from a node on, or -1; its arguments are arrays, since reading tuples is slower."""
     while node >= 0 and nodes[node, 0] >= 0:
         feature = nodes[node, 0]
         kind = features[feature, 0]
@@ -246,7 +248,7 @@ def leaves_of(graphs: ClassGraphs, j: int, states: Ints, actions: Ints, followin
 
 @compiled
 def class_chances(graphs: ClassGraphs, n_classes: int, states: Ints, actions: Ints, following: Ints) -> Floats:
-    """Probability of each class of transitions [B, F], [B, K]; what graphs leave over is that of class 0."""
+    """Probability of each class of transitions, [B, K]; class 0 gets the probability that remains."""
     features, cells, encoding, nodes = graphs.features, graphs.cells, graphs.encoding, graphs.node
     first, action_classes, classes, rate = graphs.first, graphs.action_classes, graphs.classes, graphs.rate
     result = np.zeros((len(actions), n_classes), dtype=np.float64)
@@ -267,12 +269,12 @@ def class_chances(graphs: ClassGraphs, n_classes: int, states: Ints, actions: In
 def check_graphs(
     state: Mapping[str, NDArray[Any]], cardinalities: Sequence[int], n_actions: int, n_classes: int, cells: Ints
 ) -> ClassGraphs:
-    """The graphs that arrays from a file stand for.
+    """The graphs in arrays from a file.
 
     Raises:
-        ValueError: they are not those of graphs of these factors, actions and classes.
+        ValueError: the arrays are not graphs of these factors, actions and classes.
     """
-    wrong = "These weights are not those of a learned reward of this environment; the file is damaged, or of another one."
+    wrong = "These weights are not those of a learned reward of this environment; the file is damaged or of another environment."
     if set(state) != set(SAVED_CLASSES):
         raise ValueError(wrong)
     kinds = {"acts": np.bool_, "rate": np.float64}

@@ -1,7 +1,7 @@
 """Sampling from decision graphs, compiled: next states and probabilities.
 
-Variables with synchronic arcs (graphs in ``synchronic``) are drawn after all others, given the values drawn so far (the
-paper's conditioner, section 3.2), but only in rows where they are uncertain by themselves; ``terminated`` always is.
+Variables with synchronic arcs (graphs in ``synchronic``) are drawn after all others, given the values drawn so far (the paper's
+conditioner, section 3.2), but only in rows where they are uncertain without these arcs; ``terminated`` always uses its arcs.
 Shapes: B batch, F factors, U variables (the last two are ``terminated`` and the reset), Q mutex groups, D features, D' of them
 of single factors.
 """
@@ -26,13 +26,13 @@ class Work(NamedTuple):
     """Work space for one row at a time.
 
     Attributes:
-        on: which columns are on, bool [D + D' + M'], those of the next state last.
-        values: of all units, int64 [U].
-        rates: all units' distributions, [sum of cardinalities].
-        still: which units have no graphs, bool [U].
-        later: which units are drawn late, bool [U].
-        shown: where each factor's columns begin among the state's, int64 [F + 1].
-        joint: the distribution of a coupling, or of a unit.
+        on: features, bool [D + D' + M'], those of the next state last.
+        values: current values of all variables, int64 [U].
+        rates: distributions of all variables, [sum of cardinalities].
+        still: which variables have no graphs, bool [U].
+        later: which variables have synchronic arcs, bool [U].
+        shown: where each factor's features begin among the state's, int64 [F + 1].
+        joint: the distribution of a mutex group or variable.
     """
 
     on: Bools
@@ -46,7 +46,7 @@ class Work(NamedTuple):
 
 @compiled
 def work_space(layout: Layout, graphs: Graphs, synchronic: Graphs) -> Work:
-    """Room for a row."""
+    """Work space for a row."""
     still, later = np.ones(len(layout.outputs), dtype=np.bool_), np.zeros(len(layout.outputs), dtype=np.bool_)
     still[graphs.changing], later[synchronic.changing] = False, True
     return Work(
@@ -62,7 +62,7 @@ def work_space(layout: Layout, graphs: Graphs, synchronic: Graphs) -> Work:
 
 @compiled
 def alone(layout: Layout, graphs: Graphs, later: Bools) -> Ints:
-    """Units with graphs that are drawn each for itself, before those that are drawn late."""
+    """Variables with graphs that are drawn independently: those without mutex group and synchronic arcs."""
     chosen = np.zeros(len(layout.outputs), dtype=np.bool_)
     for variable in graphs.changing:
         chosen[variable] = layout.mutex_of[variable] < 0 and not later[variable]
@@ -71,7 +71,7 @@ def alone(layout: Layout, graphs: Graphs, later: Bools) -> Ints:
 
 @compiled
 def reset_rates(states: Ints, actions: Ints, layout: Layout, graphs: Graphs) -> Floats:
-    """Probability of the event, [B]."""
+    """Probability of a reset, [B]."""
     w, rates = work_space(layout, graphs, graphs), np.empty(len(states), dtype=np.float64)
     reset = np.array([len(layout.outputs) - 1])
     for b in range(len(states)):
@@ -83,7 +83,7 @@ def reset_rates(states: Ints, actions: Ints, layout: Layout, graphs: Graphs) -> 
 
 @compiled
 def _pick(probs: Floats, start: int, n: int, u: float, otherwise: int) -> int:
-    """Index drawn from ``n`` numbers of ``probs``, or the likeliest where ``u`` is negative."""
+    """Index drawn from ``n`` probabilities of ``probs``, or the most probable one if ``u`` is negative."""
     if u < 0.0:
         return int(np.argmax(probs[start : start + n]))
     chosen = otherwise
@@ -108,9 +108,9 @@ def sample(
     following: Ints,
     terminated: Bools,
 ) -> None:
-    """Draws next states into ``following`` [B, F] and ``terminated`` [B], unit u of row b at number u of key b.
+    """Draws next states into ``following`` [B, F] and ``terminated`` [B], variable u of row b with random number u of key b.
 
-    ``following`` holds a copy of ``states``; ``greedy`` takes the likeliest value each time instead.
+    ``following`` must be a copy of ``states``; with ``greedy``, each variable gets its most probable value instead.
     """
     w, n_variables = work_space(layout, graphs, synchronic), len(layout.outputs)
     early = alone(layout, graphs, w.later)
@@ -140,14 +140,14 @@ def sample(
 
 @compiled
 def needs_synchronic(variable: int, action: int, w: Work, layout: Layout, graphs: Graphs) -> bool:
-    """Whether a unit that has late graphs needs them here: of what may follow, more than one value was observed, or is likely.
+    """Whether a variable with synchronic arcs needs them here: more than one next value was observed or is not negligible.
 
     Args:
         variable: its number.
         action: the action.
-        w: columns, present values and rates, as ``distributions`` left them.
-        layout: the units.
-        graphs: of each unit for itself.
+        w: features, current values and rates, as written by ``distributions``.
+        layout: the variables.
+        graphs: without synchronic arcs.
     """
     n = layout.outputs[variable]
     if variable == len(layout.outputs) - 2 or settled(w.rates, graphs.start[variable], n) < 0:
@@ -164,7 +164,7 @@ def needs_synchronic(variable: int, action: int, w: Work, layout: Layout, graphs
 
 @compiled
 def _show_variable(variable: int, following: Ints, w: Work, layout: Layout) -> None:
-    """Shows what a unit became."""
+    """Writes the features of a variable's next value to ``w.on``."""
     n = n_features(layout)
     for member in range(layout.first[variable], layout.first[variable + 1]):
         factor = layout.members[member]
@@ -174,7 +174,7 @@ def _show_variable(variable: int, following: Ints, w: Work, layout: Layout) -> N
 
 @compiled
 def _draw(variable: int, u: float, w: Work, layout: Layout, graphs: Graphs, following: Ints, terminated: Bools, b: int) -> None:
-    """Draws a unit's value into a next state [F], or into ``terminated[b]``."""
+    """Draws a variable's value into a next state [F], or into ``terminated[b]``."""
     chosen = _pick(w.rates, graphs.start[variable], layout.outputs[variable], u, w.values[variable])
     if variable == len(layout.outputs) - 2:
         terminated[b] = chosen == 1
@@ -188,10 +188,10 @@ def log_prob(
 ) -> Floats:
     """Log-probability [B] of next states [B, F] and ends [B]."""
     w, n_variables, result = work_space(layout, graphs, synchronic), len(layout.outputs), np.zeros(len(states), dtype=np.float64)
-    other, everything = np.empty(states.shape[1], dtype=np.int64), np.arange(n_variables - 1)
+    other, variables = np.empty(states.shape[1], dtype=np.int64), np.arange(n_variables - 1)
     for b in range(len(states)):
         show(states[b], actions[b], layout, w.on)
-        distributions(everything, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
+        distributions(variables, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
         if len(synchronic.changing):
             show_next(following[b], layout, w.on)
             show_next_adjacencies(following[b], layout, w.on)
@@ -199,7 +199,7 @@ def log_prob(
             if needs_synchronic(synchronic.changing[i], actions[b], w, layout, graphs):
                 distributions(synchronic.changing[i : i + 1], states[b], actions[b], layout, synchronic, w.on, w.values, w.rates)
         other[:] = states[b]
-        for variable in everything:
+        for variable in variables:
             if layout.mutex_of[variable] >= 0:
                 continue
             then = int(terminated[b]) if variable == n_variables - 2 else read(following[b], int(variable), layout)
@@ -220,11 +220,11 @@ def log_prob(
 @compiled
 def marginals(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, start: Ints, out: Floats) -> None:
     """Writes each factor's distribution to ``out`` [B, sum of cardinalities]; factor f's begins at ``start[f]``."""
-    w, everything = work_space(layout, graphs, graphs), np.arange(len(layout.outputs) - 2)
+    w, variables = work_space(layout, graphs, graphs), np.arange(len(layout.outputs) - 2)
     for b in range(len(states)):
         show(states[b], actions[b], layout, w.on)
-        distributions(everything, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
-        for variable in everything:
+        distributions(variables, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
+        for variable in variables:
             first, last = layout.first[variable], layout.first[variable + 1]
             for k in range(layout.outputs[variable]):
                 p = w.rates[graphs.start[variable] + k]
@@ -246,7 +246,7 @@ def _write_bit(out: Floats, start: int, p: float) -> None:
 
 @compiled
 def settled(probs: Floats, start: int, n: int) -> int:
-    """The only one of ``n`` values worth drawing, or -1."""
+    """The only one of ``n`` values whose probability is not negligible, or -1."""
     best = 0
     for k in range(1, n):
         if probs[start + k] > probs[start + best]:
@@ -271,7 +271,7 @@ def only_possible(probs: Floats, start: int, n: int) -> int:
 
 @compiled
 def uncertain(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, variables: Ints) -> Bools:
-    """In which rows some units need their late graphs, bool [B, len(units)]."""
+    """In which rows the given variables need their synchronic graphs, bool [B, len(variables)]."""
     w, result = work_space(layout, graphs, graphs), np.zeros((len(states), len(variables)), dtype=np.bool_)
     for b in range(len(states)):
         show(states[b], actions[b], layout, w.on)

@@ -1,9 +1,9 @@
-"""How much better outcomes are explained when rows are told apart by a column: exact Bayesian evidence, compiled.
+"""Bayesian score of splits: exact gain in log marginal likelihood, compiled.
 
-Rows of a head fall into *contexts*. A *split* takes those rows of some contexts in which a column is on; they share
-one rate then, whatever their context (pooling: a wall's evidence comes from all its sides), and all other rows keep
-the rates of their contexts. The evidence for a rate is the marginal likelihood under a Beta prior (Heckerman, Geiger and
-Chickering 1995), which small strengths turn into a preference for pure rows. Shapes: R rows, D columns, C contexts.
+Rows of a target belong to *contexts*. A *split* divides the rows of some contexts by a feature; on each side, either all these
+contexts share one rate (pooling: a wall is learned from all directions together), or each keeps a rate of its own. The evidence
+of a rate is the marginal likelihood under a Beta prior (Heckerman, Geiger and Chickering 1995), whose small strength favours pure
+contexts. Shapes: R rows, D features, C contexts.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from mbagent_envs.jit import compiled
 Tables: TypeAlias = tuple[Floats, Floats, Floats]
 
 BY_ALL, BY_ACTION, BY_VALUE, BY_CONTEXT = 0, 1, 2, 3
-"""Contexts that a split may pool: all, those of one action, those of one present value, or a single one."""
+"""Sets of contexts that a split can apply to: all, those of one action, those of one current value, or a single one."""
 
 STRENGTH = 0.2
 """Both parameters of the Beta prior."""
 
 
 class FeatureBlocks(NamedTuple):
-    """Columns that are on in each row, in compressed rows.
+    """Features that are on in each row, in compressed sparse row format.
 
     Attributes:
         first: int64 [N + 1].
@@ -41,15 +41,15 @@ class FeatureBlocks(NamedTuple):
 
 
 class Target(NamedTuple):
-    """Rows in which one value of one unit is possible, and how often it came; rows that look alike are one row here.
+    """A one-vs-rest target: patterns after which a value of a variable is possible, and how often it was observed.
 
     Attributes:
-        rows: numbers of rows, int64 [R].
-        counts: how often each was met, int64 [R].
-        positives: how often the value came then, int64 [R].
-        context: int64 [R], 0 ... C - 1.
-        action: of each context, int64 [C]; -1 where contexts of several actions were merged.
-        value: of the unit in each context, int64 [C]; -1 likewise.
+        rows: numbers of the patterns in the feature table, int64 [R].
+        counts: how often each pattern was observed, int64 [R].
+        positives: how often the value came next, int64 [R].
+        context: context of each pattern, 0 ... C - 1, int64 [R].
+        action: action class of each context, int64 [C]; -1 if contexts of several classes were merged.
+        value: the variable's current value in each context, int64 [C]; -1 if several were merged.
     """
 
     rows: Ints
@@ -64,10 +64,10 @@ class Chosen(NamedTuple):
     """A split.
 
     Attributes:
-        gain: evidence beyond its price; 0 where no split has any.
+        gain: gain in log evidence, including the log prior odds; 0 if no split has a positive gain.
         kind: BY_ALL, BY_ACTION, BY_VALUE or BY_CONTEXT.
         which: the action, the value or the context.
-        feature: what the rows are told apart by.
+        feature: the feature that divides the rows.
     """
 
     gain: float
@@ -77,18 +77,18 @@ class Chosen(NamedTuple):
 
 
 def feature_blocks(table: NDArray[np.generic]) -> FeatureBlocks:
-    """Columns of a table [N, D] of zeros and ones."""
+    """Features of a table [N, D] of zeros and ones."""
     rows, feature = np.nonzero(table)
     first = np.searchsorted(rows, np.arange(len(table) + 1)).astype(np.int64)
     return FeatureBlocks(first, feature.astype(np.int64), table.shape[1])
 
 
 def evidence_tables(n: int, certain: float = 0.0, strength: float = STRENGTH) -> Tables:
-    """What the evidence of up to ``n`` rows is put together from, see ``evidence``.
+    """Tables from which ``evidence`` of up to ``n`` rows is computed.
 
     Args:
-        n: rows.
-        certain: probability that a rate is 0 or 1, before any row is seen; else it has the Beta prior.
+        n: maximum number of rows.
+        certain: prior probability that a rate is 0 or 1; otherwise it has the Beta prior.
         strength: both parameters of the Beta prior.
     """
     i = np.arange(n)
@@ -116,11 +116,11 @@ def evidences(positives: Ints, n: Ints, tables: Tables) -> Floats:
 
 
 class Tally(NamedTuple):
-    """What a head's rows come to.
+    """Counts of a target's rows.
 
     Attributes:
-        n, e: rows and arrivals of each context, int64 [C].
-        on, positives_on: those with each column on, int64 [C, D].
+        n, e: rows and positives of each context, int64 [C].
+        on, positives_on: those with each feature on, int64 [C, D].
     """
 
     n: Ints
@@ -131,7 +131,7 @@ class Tally(NamedTuple):
 
 @compiled
 def count(target: Target, features: FeatureBlocks) -> Tally:
-    """Counts rows and arrivals of each context, with each column on."""
+    """Counts rows and positives of each context, in all and with each feature on."""
     n_contexts = len(target.action)
     n, e = np.zeros((2, n_contexts), dtype=np.int64)
     on, positives_on = np.zeros((2, n_contexts, features.n_features), dtype=np.int64)
@@ -146,14 +146,14 @@ def count(target: Target, features: FeatureBlocks) -> Tally:
 
 
 class Sets(NamedTuple):
-    """Sets of contexts that a split may be about: all, those of each action, those of each present value.
+    """Sets of contexts that a split can apply to: all, those of each action, those of each current value.
 
     Attributes:
-        of: numbers of the sets that each context is in, int64 [C, 3]; the last number is one that counts for nothing.
-        n, e: rows and arrivals of each set, int64 [S].
-        evidence: of its contexts' own rates, summed, [S].
-        base: of each context's own rate, [C].
-        n_actions: number of sets that are an action's.
+        of: numbers of the sets that contain each context, int64 [C, 3]; the last set is a placeholder that is never used.
+        n, e: rows and positives of each set, int64 [S].
+        evidence: evidence of a set's contexts with separate rates, summed, [S].
+        base: evidence of each context's own rate, [C].
+        n_actions: number of sets of actions.
     """
 
     of: Ints
@@ -184,16 +184,16 @@ def _sets(target: Target, n: Ints, e: Ints, one: Floats, two: Floats, alike: Flo
 
 @compiled
 def best_split(target: Target, tally: Tally, prior: Floats, narrow: Floats, tables: Tables) -> Chosen:
-    """The split with the most evidence beyond its price.
+    """The split with the highest gain.
 
-    On either side of the split, the contexts of the set share one rate or keep a rate each, whichever has more evidence.
+    On either side of the split, the contexts of the set share one rate or have a rate each, whichever has more evidence.
 
     Args:
-        target: the rows, with at least two outcomes that differ.
+        target: the rows, with both outcomes.
         tally: their counts.
-        prior: log prior odds of each column as a cause in all contexts, [D]; -inf for one that must not be.
+        prior: log prior odds of a split by each feature in all contexts, [D]; -inf for features that are excluded.
         narrow: log prior odds to be added for contexts of one action, of one value, and for a single context, [3].
-        tables: evidence_tables of at least R.
+        tables: ``evidence_tables`` for at least the sum of the target's counts.
     """
     one, two, alike = tables
     n, e, on, positives_on = tally
@@ -209,14 +209,14 @@ def best_split(target: Target, tally: Tally, prior: Floats, narrow: Floats, tabl
         for c in range(len(n)):
             if on[c, b] == 0:
                 continue
-            those = evidence(positives_on[c, b], on[c, b], one, two, alike)
+            own = evidence(positives_on[c, b], on[c, b], one, two, alike)
             others = evidence(e[c] - positives_on[c, b], n[c] - on[c, b], one, two, alike) - sets.base[c]
             for s in sets.of[c]:
                 set_n[s] += on[c, b]
                 set_e[s] += positives_on[c, b]
-                inside[s] += those
+                inside[s] += own
                 outside[s] += others
-            gain = those + others + prior[b] + narrow[2]
+            gain = own + others + prior[b] + narrow[2]
             if gain > best and on[c, b] < n[c]:
                 best, kind, which, chosen = gain, BY_CONTEXT, c, b
         for s in range(n_sets - 1):

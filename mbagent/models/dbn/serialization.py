@@ -1,4 +1,4 @@
-"""Decision graphs to and from plain arrays; what comes from a file is checked, since compiled kernels check nothing."""
+"""Decision graphs to and from plain arrays; arrays from files are validated, since compiled kernels check nothing."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mbagent.models.dbn.features import Layout
 _FILE_NAMES = {"feature": "column", "persistence": "stays", "unseen_mass": "novelty"}
 
 SAVED = {_FILE_NAMES.get(field, field): field for field in Graphs._fields if field != "noise"}
-"""Names in files and the fields that they are of. ``noise`` belongs to planning and is not learned."""
+"""Fields of ``Graphs`` by their names in files. ``noise`` belongs to planning and is not saved."""
 
 _FLOATS = ("rate", "spread", "stays", "novelty", "base", "still")
 
@@ -25,7 +25,7 @@ def to_arrays(graphs: Graphs) -> dict[str, NDArray[Any]]:
 
 
 def table_of(array: NDArray[Any], width: int) -> NDArray[np.int64]:
-    """Whole numbers, int64 [n, width].
+    """The array as integers, int64 [n, width].
 
     Raises:
         ValueError: the array has another width.
@@ -36,19 +36,19 @@ def table_of(array: NDArray[Any], width: int) -> NDArray[np.int64]:
 
 
 def from_arrays(arrays: Mapping[str, NDArray[Any]], layout: Layout, n_features: int) -> Graphs:
-    """The graphs that ``to_arrays`` took apart.
+    """The graphs, from the result of ``to_arrays``.
 
     Args:
         arrays: by name.
-        layout: the units.
-        n_features: number of columns that nodes can ask for.
+        layout: the variables.
+        n_features: number of features that nodes can test.
 
     Raises:
-        ValueError: they are no graphs of these units.
+        ValueError: the arrays are not graphs of these variables.
     """
     missing = sorted(set(SAVED) ^ set(arrays))
     if missing:
-        raise ValueError(f"These weights are no decision graphs (first difference: {missing[0]!r}).")
+        raise ValueError(f"These weights are not decision graphs (first difference: {missing[0]!r}).")
     kinds = {name: np.float64 if name in _FLOATS else np.int64 for name in SAVED}
     flat: dict[str, Any] = {
         SAVED[name]: np.ascontiguousarray(array, dtype=kinds[name]).reshape(-1) for name, array in arrays.items()
@@ -56,13 +56,13 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]], layout: Layout, n_features: 
     graphs = Graphs(**flat, noise=np.zeros(1))
     if not _sound(graphs, layout, n_features):
         raise ValueError(
-            "These weights do not fit: they are no graphs of these units; load them into a model of the same environment."
+            "These weights do not fit: they are not graphs of these variables; load them into a model of the same environment."
         )
     return graphs
 
 
 def _sound(graphs: Graphs, layout: Layout, n_features: int) -> bool:
-    """Whether every index leads somewhere and no path is endless."""
+    """Whether all indices and values are valid and no path is a cycle."""
     n_variables, n_nodes, n_entries = len(layout.outputs), len(graphs.feature), len(graphs.values)
     pairs = np.concatenate([[0], np.cumsum(layout.encoding.n_action_classes * layout.outputs)])
     start = np.concatenate([[0], np.cumsum(layout.outputs)])
@@ -83,15 +83,15 @@ def _sound(graphs: Graphs, layout: Layout, n_features: int) -> bool:
     if any(len(getattr(graphs, SAVED[name])) != length for name, length in lengths.items()):
         return False
     shares = [getattr(graphs, SAVED[name]) for name in _FLOATS]
-    asks, numbers = graphs.feature >= 0, np.arange(n_nodes)
+    inner, numbers = graphs.feature >= 0, np.arange(n_nodes)
     return bool(
         _within(graphs.changing, n_variables)
         and _within(graphs.feature + 1, n_features + 1)
         and _within(graphs.nodes, n_nodes)
         and (np.diff(graphs.entries) >= 0).all()
         and (graphs.entries[0], graphs.entries[-1]) == (0, n_entries)
-        and ((graphs.off >= 0) & (graphs.off < numbers))[asks].all()
-        and ((graphs.on >= 0) & (graphs.on < numbers))[asks].all()
+        and ((graphs.off >= 0) & (graphs.off < numbers))[inner].all()
+        and ((graphs.on >= 0) & (graphs.on < numbers))[inner].all()
         and _values_fit(graphs, layout)
         and all(np.isfinite(share).all() and (share >= 0.0).all() and (share <= 1.0).all() for share in shares)
         and (np.add.reduceat(graphs.base, start[:-1]) <= 1.0 + 1e-6).all()
@@ -99,7 +99,7 @@ def _sound(graphs: Graphs, layout: Layout, n_features: int) -> bool:
 
 
 def _values_fit(graphs: Graphs, layout: Layout) -> bool:
-    """Whether each entry's value is one that its unit has."""
+    """Whether each entry's value is less than its variable's cardinality."""
     pair = np.repeat(np.arange(len(graphs.entries) - 1), np.diff(graphs.entries))
     variable = np.searchsorted(graphs.pairs, pair, side="right") - 1
     return bool(((graphs.values >= 0) & (graphs.values < layout.outputs[variable])).all())

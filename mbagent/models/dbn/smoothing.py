@@ -1,4 +1,4 @@
-"""What a unit does after a present value and an action, whatever else is the case: how often it stays, or does what is new."""
+"""Back-off statistics of a variable given its value and the action: persistence and the probability of a value never observed."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ THETAS = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0, 1000.0)
 
 @dataclass(frozen=True)
 class Smoothing:
-    """What a unit does after each pair (way, value), whatever else is the case.
+    """Statistics of a variable after each (action class, value) pair, regardless of all other features.
 
     Attributes:
-        persistence: share of a pair's rows in which the unit kept its value, [pairs]; 1 where there are none.
-        unseen_mass: probability that it does what it never did after that pair, [pairs]; where there are no
-            rows, as after one.
-        base: how often each value came anew, [cardinality], summing to one.
+        persistence: share of a pair's rows in which the variable kept its value, [pairs]; 1 without rows.
+        unseen_mass: probability of outcomes never observed after that pair, [pairs]; without rows, as after one row.
+        base: smoothed frequency of each value among changes, [cardinality], summing to one.
     """
 
     persistence: Floats
@@ -30,11 +29,11 @@ class Smoothing:
 
 @dataclass(frozen=True)
 class Pools:
-    """Pairs whose rows are counted together for what is new.
+    """Pairs whose rows are counted together for the unseen mass.
 
     Attributes:
         of: number of each pair's pool, int64 [pairs].
-        positives: what came in each row, by any numbers that mean the same throughout a pool, int64 [N].
+        positives: outcome of each row, numbered consistently within a pool, int64 [N].
     """
 
     of: Ints
@@ -42,19 +41,19 @@ class Pools:
 
 
 def smoothing_of(cardinality: int, n_actions: int, actions: Ints, now: Ints, then: Ints, pools: Pools | None = None) -> Smoothing:
-    """A unit's habit in N rows; where ``pools`` is None, each pair (action, present value) is a pool, and what comes is a value.
+    """Statistics of a variable in N rows; without ``pools``, each (action, current value) pair is a pool and outcomes are values.
 
-    Novelty falls with the rows seen as in Ewens' sampling formula, theta / (rows + theta), with the theta under which what
-    followed each pair is foretold best, each row from the others: large where anything may follow, next to nothing
-    where the same things follow again and again.
+    The unseen mass decreases with the number of rows as in Ewens' sampling formula, theta / (rows + theta). Theta has the best
+    leave-one-out likelihood of the outcomes: it is large if many different outcomes follow a pair, and close to zero if the same
+    outcomes recur.
     """
     size = n_actions * cardinality
     pair = actions * cardinality + now
     visits = np.bincount(pair, minlength=size).astype(np.float64)
     stayed = np.bincount(pair[now == then], minlength=size)
     persistence = np.where(visits > 0, stayed / np.maximum(visits, 1), 1.0)
-    anew = np.bincount(then[now != then], minlength=cardinality) + 0.5
-    base = anew / anew.sum()
+    changes = np.bincount(then[now != then], minlength=cardinality) + 0.5
+    base = changes / changes.sum()
     if cardinality == 2 or len(pair) == 0:
         return Smoothing(persistence, np.zeros(size), base)
     if pools is None:
@@ -65,13 +64,13 @@ def smoothing_of(cardinality: int, n_actions: int, actions: Ints, now: Ints, the
 
 
 def _unseen_mass(pool_of: Ints, pool: Ints, positives: Ints, base: Floats) -> Floats:
-    """Probability of what is new after each pair.
+    """Probability of unseen outcomes after each pair.
 
     Args:
         pool_of: pool of each pair, int64 [pairs].
         pool: pool of each row, int64 [N].
-        positives: what came in each row, int64 [N].
-        base: how likely that is where nothing is known, [N].
+        positives: outcome of each row, int64 [N].
+        base: probability of that outcome without any data, [N].
     """
     visits = np.bincount(pool, minlength=int(pool_of.max()) + 1).astype(np.float64)
     _, first, times = np.unique(pool * (int(positives.max()) + 1) + positives, return_index=True, return_counts=True)

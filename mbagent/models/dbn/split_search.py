@@ -1,9 +1,9 @@
 """Greedy search for the splits of decision graphs, by single features and by pairs (paper section 5, modules).
 
-The most certain splits provide a prior for the others: which kinds of features are causes at all, whether one feature serves many
-targets or each target has its own, and how many causes a target has. With little data this prior decides. A pair of features that
-matters only jointly, such as exclusive or, changes no target by itself, so all pairs are scored at once: the counts of their four
-cells in a context are one matrix product.
+The most certain splits provide a prior for the others: which kinds of features are relevant, whether one feature serves many
+targets or each target has its own, and how many splits a target has. With little data this prior decides. If two features matter
+only jointly, as in exclusive or, neither has a gain by itself. So all pairs are scored together (depth-two lookahead, Murthy and
+Salzberg 1995): the counts of their four cells in a context are one matrix product.
 """
 
 from __future__ import annotations
@@ -36,43 +36,43 @@ PATTERNS: tuple[tuple[bool, bool, bool, bool], ...] = (
     (True, False, False, False),
     (False, True, True, False),
 )
-"""Which of the cells (neither, second only, first only, both) are told apart from the others."""
+"""Patterns of a pairwise split: which of the cells (neither, second only, first only, both) are separated from the others."""
 
 FEWEST_PAIR_ROWS = 20
-"""Rows that a context must have."""
+"""Minimum number of rows of a context for pairwise splits."""
 
 FIRST_THRESHOLD = 3.0
-"""Log prior odds against one more cause, before any was found."""
+"""Log prior odds against one more split, before any splits were found."""
 
 LEAST_GAIN = 1.0
-"""Least price of a cause, nats, however likely the prior makes it."""
+"""Minimum log prior odds against a split, in nats, however probable its feature is in the prior."""
 
 MOST_WORK = 5_000_000_000
-"""Pairs of columns are looked for in a context as long as rows times columns times columns stay below this."""
+"""Maximum number of rows times features times features for which a context is searched for pairs."""
 
 TELLING = 2
-"""Pairs from which on their kinds tell what kinds the next ones are of."""
+"""Number of pairs from which on their kinds and patterns are a prior for further pairs."""
 
 MOST_CONTEXTS = 4
-"""Contexts of a head that pairs are looked for in, the most mixed ones."""
+"""Maximum number of contexts of a target that are searched for pairs, those with the most uncertain outcomes."""
 
 
 MOST_PAIRED_FEATURES = 500
-"""Columns that pairs are made of; of more, those that tell most by themselves."""
+"""Maximum number of features in pairs; of more, those with the largest gain by themselves."""
 
 EXACT_FLOATS = 2**24
-"""Sums up to here are exact in single precision."""
+"""Sums of integers below this are exact in single precision."""
 
 SPARSE = 16.0
-"""Pairs of columns that are on are counted one by one where a matrix product would take so many times as many steps."""
+"""Pairs of features that are on are counted one by one if a matrix product needs more than this many times as many steps."""
 
 
 class PairSearch:
-    """Looks for pairs of columns where single ones explain nothing more.
+    """Searches for pairwise splits where single features have no further gain.
 
     Args:
-        kinds: kind of each column, int64 [D].
-        table: columns of all rows, bool [N, D].
+        kinds: kind of each feature, int64 [D].
+        table: features of all rows, bool [N, D].
         tables: see ``evidence_tables``.
     """
 
@@ -83,7 +83,7 @@ class PairSearch:
         self._found: list[Pair] = []
 
     def divide(self, searches: Sequence[Search]) -> bool:
-        """One round over all heads that changed since the last; whether any pair was found."""
+        """One round over all targets that changed since the last; returns whether any pair was found."""
         prior, found = self._prior(), False
         for h, search in enumerate(searches):
             if not search.open or self._n_searched.get(h) == len(search.splits):
@@ -98,13 +98,13 @@ class PairSearch:
         return found
 
     def _worth(self, search: Search, most: float) -> list[int]:
-        """Contexts whose rows are so mixed that a pair could pay its price, the most mixed first."""
+        """Contexts with outcomes so uncertain that a pair could have a positive gain, the most uncertain first."""
         n, e = search.counts()
         cost = -evidences(e, n, self.tables)
         return [int(c) for c in np.argsort(-cost, kind="stable")[:MOST_CONTEXTS] if cost[c] > -most]
 
     def _pattern_prior(self) -> Floats:
-        """Log probability of each pattern: those found already are likelier."""
+        """Log probability of each pattern; patterns that were found before are more probable."""
         counts = np.full(len(PATTERNS), 0.2)
         if len(self._found) >= TELLING:
             for pair in self._found:
@@ -113,7 +113,7 @@ class PairSearch:
         return result
 
     def _prior(self) -> Floats:
-        """Log prior odds of each pair of columns, [D, D]: pairs of a kind already found are likelier, of fresh columns most."""
+        """Log prior odds of each pair of features, [D, D]; known pairs of kinds and unused features are more probable."""
         n = len(self.kinds)
         if len(self._found) < TELLING:
             return np.full((n, n), -math.log(max(1.0, n * (n - 1) / 2)) - FIRST_THRESHOLD)
@@ -125,7 +125,8 @@ class PairSearch:
             share[m, k] += 0.5
             used[[pair.first, pair.second]] = True
         fresh = np.bincount(self.kinds[~used], minlength=n_kinds).clip(1)
-        # Where some columns of one kind each had a partner of another kind, the next one has, too: only who it is has a price.
+        # If features of one kind were paired with features of another kind, the next one probably is, too: the prior then only
+        # charges for which feature it is.
         odds = np.log(share / share.sum() / np.maximum.outer(fresh, fresh))[self.kinds[:, None], self.kinds]
         result: Floats = odds - LEAST_GAIN - np.where(used[:, None] | used, 3.0, 0.0)
         return result
@@ -134,13 +135,13 @@ class PairSearch:
 def find_pairs(
     target: Target, contexts: Sequence[int], table: Bools, prior: Floats, patterns: Floats, tables: Tables
 ) -> list[Pair]:
-    """The best pair, and after it further ones in the same context that have no column in common with those before.
+    """The best pair, then further ones in the same context that have no features in common with the pairs before.
 
     Args:
         target: the rows.
-        contexts: contexts to look in.
-        table: columns of all rows, bool [N, D].
-        prior: log prior odds of each pair of columns, [D, D].
+        contexts: contexts to search.
+        table: features of all rows, bool [N, D].
+        prior: log prior odds of each pair of features, [D, D].
         patterns: log probability of each pattern.
         tables: see ``evidence_tables``.
     """
@@ -152,15 +153,15 @@ def find_pairs(
             and rows.sum() * min(table.shape[1], MOST_PAIRED_FEATURES) ** 2 < MOST_WORK
         ):
             here, counts, positives = table[target.rows[rows]], target.counts[rows], target.positives[rows]
-            kept = _telling_most(here, counts, positives, tables)
+            kept = _most_informative(here, counts, positives, tables)
             pairs = _in_context(context, here[:, kept], counts, positives, prior[np.ix_(kept, kept)], patterns, tables)
             found += [pair._replace(first=int(kept[pair.first]), second=int(kept[pair.second])) for pair in pairs]
     best = max(found, default=None)
     return [] if best is None else [pair for pair in found if pair.context == best.context]
 
 
-def _telling_most(table: Bools, counts: Ints, positives: Ints, tables: Tables) -> Ints:
-    """Numbers of the columns that pairs are made of, ascending: all of them, or those that tell most by themselves."""
+def _most_informative(table: Bools, counts: Ints, positives: Ints, tables: Tables) -> Ints:
+    """Numbers of the features in pairs, ascending: all of them, or those with the largest gain by themselves."""
     n_features = table.shape[1]
     if n_features <= MOST_PAIRED_FEATURES:
         return np.arange(n_features)
@@ -173,8 +174,8 @@ def _telling_most(table: Bools, counts: Ints, positives: Ints, tables: Tables) -
 def _in_context(
     context: int, table: Bools, counts: Ints, positives: Ints, prior: Floats, patterns: Floats, tables: Tables
 ) -> list[Pair]:
-    arrived = positives > 0
-    both_n, both_e = _both(table, counts), _both(table[arrived], positives[arrived])
+    any_positive = positives > 0
+    both_n, both_e = _both(table, counts), _both(table[any_positive], positives[any_positive])
     best, which = _best_patterns(
         both_n, both_e, int(counts.sum()), int(positives.sum()), np.asarray(PATTERNS), patterns, prior, tables
     )
@@ -190,7 +191,7 @@ def _in_context(
 
 
 def _both(on: Bools, weights: Ints) -> Ints:
-    """Weight of the rows in which both of two columns are on, int64 [D, D]; only the upper triangle counts."""
+    """Weight of the rows in which both of two features are on, int64 [D, D]; only the upper triangle is valid."""
     per_row = on.sum(axis=1)
     if SPARSE * float((per_row**2).sum()) < float(on.size) * on.shape[1]:
         first = np.concatenate([[0], np.cumsum(per_row)]).astype(np.int64)
@@ -204,7 +205,7 @@ def _both(on: Bools, weights: Ints) -> Ints:
 
 @compiled
 def _count_both(first: Ints, feature: Ints, weights: Ints, n_features: int) -> Ints:
-    """As ``_both``, of columns in compressed rows, ascending in each."""
+    """As ``_both``, of features in compressed sparse row format, ascending in each row."""
     both = np.zeros((n_features, n_features), dtype=np.int64)
     for r in range(len(weights)):
         for i in range(first[r], first[r + 1]):
@@ -217,9 +218,9 @@ def _count_both(first: Ints, feature: Ints, weights: Ints, n_features: int) -> I
 def _best_patterns(
     both_n: Ints, both_e: Ints, n: int, e: int, inside: Bools, patterns: Floats, prior: Floats, tables: Tables
 ) -> tuple[Floats, Ints]:
-    """Evidence beyond its price of each pair of columns under its best pattern, [D, D], and the pattern's number.
+    """Gain of each pair of features under its best pattern, [D, D], and the pattern's number.
 
-    Below the diagonal and on it there are no pairs.
+    Only entries above the diagonal are pairs.
     """
     one, two, alike = tables
     size = len(both_n)
@@ -247,23 +248,23 @@ def _best_patterns(
 
 
 SUREST = 0.99
-"""A rate is believed to be 0 or 1 beforehand with this probability at most."""
+"""Maximum prior probability that a rate is 0 or 1."""
 
 MOST_SPLITS_A_GRAPH = 256
-"""Most splits of one head."""
+"""Maximum number of splits of one target."""
 
 
 def find_splits(targets: Sequence[Target], table: Bools, kinds: Ints, n_actions: int, in_pairs: bool = True) -> list[Search]:
-    """The splits of each head, and its rows with the contexts that they lead to.
+    """A finished search for each target: its splits, and its rows with the contexts that they lead to.
 
-    A first search tells how much of this world is certain at all; the second one knows.
+    A first search estimates the share of deterministic rates, which the second one uses in its score.
 
     Args:
-        targets: what is to be explained.
-        table: columns of all rows that look different, bool [N, D].
-        kinds: which kind of thing each column is, int64 [D]; causes of one kind make others of that kind likelier.
-        n_actions: number of actions A.
-        in_pairs: whether to look for causes that matter only together, too.
+        targets: the targets.
+        table: features of all distinct patterns, bool [N, D].
+        kinds: kind of each feature, int64 [D]; splits by features of one kind make others of that kind more probable.
+        n_actions: number of action classes.
+        in_pairs: whether to search for pairwise splits, too.
     """
     features = feature_blocks(table)
     most = max((int(target.counts.sum()) for target in targets), default=0) + 1
@@ -272,7 +273,7 @@ def find_splits(targets: Sequence[Target], table: Bools, kinds: Ints, n_actions:
 
 
 def certainty(searches: Sequence[Search]) -> float:
-    """Share of what was found that is not random at all, as believed of the rest."""
+    """Estimated share of deterministic leaves, at most ``SUREST``."""
     return min(best_prior(searches).certain, SUREST)
 
 
@@ -289,21 +290,21 @@ def _searched(
 def go_on(
     searches: Sequence[Search], table: Bools, features: FeatureBlocks, kinds: Ints, n_actions: int, tables: Tables, in_pairs: bool
 ) -> None:
-    """Divides further as long as evidence grows; see ``find_splits``."""
+    """Adds splits as long as any has a positive gain; see ``find_splits``."""
     pairs = PairSearch(kinds, table, tables)
-    going = True
-    while going:
+    improving = True
+    while improving:
         while found := _next_splits(searches, features, kinds, n_actions, tables):
             for h, chosen in found:
                 searches[h].divide(chosen, table, tables)
                 searches[h].open = len(searches[h].splits) < MOST_SPLITS_A_GRAPH
-        going = in_pairs and pairs.divide(searches)
+        improving = in_pairs and pairs.divide(searches)
 
 
 def _next_splits(
     searches: Sequence[Search], features: FeatureBlocks, kinds: Ints, n_actions: int, tables: Tables
 ) -> list[tuple[int, Chosen]]:
-    """One more split for each head that has one: of all heads, or of the surer half once there is a prior to teach."""
+    """The best split of each target with a positive gain; once there is a prior, only the half with the largest gains."""
     prior, learned = feature_prior(searches, kinds, features.n_features)
     counts = np.asarray([sum(split.feature >= 0 for split in search.splits) for search in searches])
     narrow = -np.asarray([math.log(n_actions) + 1.0, 2.0, 3.0])
@@ -320,7 +321,7 @@ def _next_splits(
 
 
 def feature_prior(searches: Sequence[Search], kinds: Ints, n_features: int) -> tuple[Floats, bool]:
-    """Log probability of each column to be the next cause [D], and whether it was learned from those found so far."""
+    """Log probability of each feature to be split by next [D], and whether it was estimated from the splits so far."""
     chosen = [split.feature for search in searches for split in search.splits if split.feature >= 0]
     if len(chosen) < max(3, len(searches) // 10):
         return np.full(n_features, -math.log(n_features)), False

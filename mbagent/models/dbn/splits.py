@@ -1,4 +1,4 @@
-"""A head in the course of the search for what it hangs on: its splits so far, and the contexts that they lead to."""
+"""State of the search for a target's splits: the splits so far, and the contexts that they lead to."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from mbagent.models.dbn.score import (
 from mbagent.types import Bools, Floats, Ints
 
 MOST_KEPT = 100_000
-"""Counts that a head keeps from one look to the next, 16 bytes each; more are counted anew."""
+"""Maximum number of counts that a target keeps between two rounds, 16 bytes each; more are counted again."""
 
 
 class Pair(NamedTuple):
-    """A context told apart by two columns.
+    """A pairwise split of one context.
 
     Attributes:
-        gain: evidence beyond its price.
+        gain: gain in log evidence, including the log prior odds.
         context: the context.
-        first, second: the columns.
-        pattern: which cells get a context of their own, see PATTERNS.
+        first, second: the features.
+        pattern: which cells get a context of their own, see ``split_search.PATTERNS``.
     """
 
     gain: float
@@ -45,12 +45,12 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class Split:
-    """Rows of some contexts told apart by a column.
+    """A division of the rows of some contexts by a feature.
 
     Attributes:
-        feature: the column; -1 for none, where contexts are only merged.
-        off, on: the new context of each old one, int64 [C each], where the column is off and on.
-        gain: evidence beyond its price, nats.
+        feature: the feature; -1 if contexts are only merged or renumbered.
+        off, on: the new context of each old one if the feature is off and on, int64 [C each].
+        gain: gain in log evidence, including the log prior odds, in nats.
     """
 
     feature: int
@@ -61,14 +61,14 @@ class Split:
 
 @dataclass
 class Search:
-    """A head in the course of the search.
+    """State of the search for a target's splits.
 
     Attributes:
-        target: its rows, with contexts as split so far.
-        prior_mean: for each context, the rate of the rows on its side of the last split that it was part of, [C]: what to
-            expect of a context with few rows.
+        target: the target, with contexts as split so far.
+        prior_mean: for each context, the rate of the rows on its side of the last split that it was part of, [C]: the prior mean
+            for contexts with few rows.
         splits: in the order found.
-        open: whether more may be found.
+        open: whether further splits are possible.
     """
 
     target: Target
@@ -84,7 +84,7 @@ class Search:
         self.prior_mean = np.full(len(self.target.action), positives / counts if counts else 0.5)
 
     def counts(self, rows: Bools | None = None) -> tuple[Ints, Ints]:
-        """Rows met and arrivals of each context, int64 [C] each; of some rows only where ``rows`` [R] is given."""
+        """Counts and positives of each context, int64 [C] each; only of the rows in the mask ``rows`` [R], if given."""
         target, size = self.target, len(self.target.action)
         some = slice(None) if rows is None else rows
         context, counts, positives = target.context[some], target.counts[some], target.positives[some]
@@ -92,7 +92,7 @@ class Search:
         return n, e
 
     def tally(self, features: FeatureBlocks) -> Tally:
-        """Counts of each context with each column on, made once where they are few."""
+        """Counts of each context with each feature on, cached up to ``MOST_KEPT`` counts."""
         if self._tally is not None:
             return self._tally
         tally = count(self.target, features)
@@ -101,14 +101,14 @@ class Search:
         return tally
 
     def merge(self, tables: Tables) -> None:
-        """Lets all contexts share one rate where that has more evidence, as a split by no column would."""
+        """Merges all contexts if one common rate has more evidence."""
         n, e = self.counts()
         if len(n) > 1 and _share(n, e, tables):
             merged, nowhere = np.zeros(len(n), dtype=np.int64), np.zeros(len(self.target.rows), dtype=np.bool_)
             self._take(Split(-1, merged, merged, 0.0), nowhere, self.prior_mean)
 
     def divide(self, chosen: Chosen, table: Bools, tables: Tables) -> None:
-        """Does the split that was found; ``table`` [N, D] holds all columns."""
+        """Applies a split; ``table`` [N, D] contains all features."""
         target, size = self.target, len(self.target.action)
         on, covered = table[target.rows, chosen.feature], self._covered(chosen)
         sides_to = np.arange(size), np.where(covered, np.arange(size) + size, np.arange(size))
@@ -123,7 +123,7 @@ class Search:
         self._take(Split(chosen.feature, numbers[:size], numbers[size:], chosen.gain), on, prior_mean[names])
 
     def divide_by_pair(self, pair: Pair, table: Bools) -> None:
-        """Gives the rows that a pair of columns tells apart a context of their own, in two splits."""
+        """Applies a pairwise split, as two splits."""
         target, size = self.target, len(self.target.action)
         rows = target.context == pair.context
         cell = 2 * table[target.rows, pair.first] + table[target.rows, pair.second]
@@ -141,7 +141,7 @@ class Search:
         self._take(Split(pair.second, *sides_to, 0.0), table[target.rows, pair.second], prior_mean)
 
     def renamed(self, numbers: Ints) -> Search:
-        """Itself, its columns having got other numbers."""
+        """This search, after its features were renumbered in place."""
         for i, split in enumerate(self.splits):
             if split.feature >= 0:
                 self.splits[i] = replace(split, feature=int(numbers[split.feature]))
@@ -151,7 +151,7 @@ class Search:
         target, size = self.target, int(max(split.on.max(), split.off.max())) + 1
         context = np.where(on, split.on[target.context], split.off[target.context])
         labels = []
-        for old in (target.action, target.value):  # a merged context keeps only what all its parts have in common
+        for old in (target.action, target.value):  # a merged context keeps a label only if all its parts have the same
             low, high = np.full(size, np.iinfo(np.int64).max), np.full(size, -2)
             for merged in (split.off, split.on):
                 np.minimum.at(low, merged, old)
@@ -163,7 +163,7 @@ class Search:
         self.splits.append(split)
 
     def _covered(self, chosen: Chosen) -> Bools:
-        """Which contexts a split is about, bool [C]."""
+        """Which contexts a split applies to, bool [C]."""
         target = self.target
         if chosen.kind == BY_ALL:
             return np.ones(len(target.action), dtype=np.bool_)
@@ -173,6 +173,6 @@ class Search:
 
 
 def _share(n: Ints, e: Ints, tables: Tables) -> bool:
-    """Whether contexts with these counts have more evidence for one rate than for a rate each."""
+    """Whether one common rate of contexts with these counts has more evidence than a rate for each."""
     pooled = evidences(e.sum(keepdims=True), n.sum(keepdims=True), tables)[0]
     return bool(pooled > evidences(e, n, tables).sum())

@@ -1,6 +1,7 @@
 """Successors of decision graphs in compiled code, for every variable in every row; see ``systematic_sampling.py``.
 
-Compiled search uses them where variables have synchronic arcs or resets happen, see ``WholeKernel``; elsewhere ``expander.py``.
+Compiled search uses them for models with resets or synchronic arcs other than termination's, see ``WholeKernel``; for all others
+it uses ``expander.py``.
 Shapes: B rows, F factors, U variables (the last two are ``terminated`` and the reset), Q mutex groups.
 """
 
@@ -47,7 +48,7 @@ from mbagent_envs.jit import compiled
 
 @compiled
 def successors(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, synchronic: Graphs, grid: Grid) -> Found:
-    """The outcomes of each row, unit after unit; see ``particles.py``. The graphs must be those for planning."""
+    """The outcomes of each row, variable by variable; see ``systematic_sampling.py``. The graphs must be those for planning."""
     w, n_variables, n_grid = work_space(layout, graphs, synchronic), len(layout.outputs), grid[0]
     single = alone(layout, graphs, w.later)
     early = np.concatenate((single[single < n_variables - 1], n_variables + np.arange(len(layout.exactly))))
@@ -94,17 +95,15 @@ def _fits(
         if possible > n_grid:
             return False
     for variable in synchronic.changing:
-        late_here = needs_synchronic(variable, action, w, layout, graphs)
-        possible *= (
-            layout.outputs[variable] if late_here else n_possible(w.rates, graphs.start[variable], layout.outputs[variable])
-        )
+        needed = needs_synchronic(variable, action, w, layout, graphs)
+        possible *= layout.outputs[variable] if needed else n_possible(w.rates, graphs.start[variable], layout.outputs[variable])
         possible = min(possible, 2 * n_grid + 1)
     return bool(possible <= 2 * n_grid)
 
 
 @compiled
 def _distribution(number: int, state: Ints, layout: Layout, graphs: Graphs, w: Work) -> tuple[int, int]:
-    """Writes the distribution of a unit, or of a coupling, to ``w.joint``; returns its size and the present value or -1."""
+    """Writes the distribution of a variable or mutex group to ``w.joint``; returns its size and the current value or -1."""
     n_variables = len(layout.outputs)
     if number >= n_variables:
         n = mutex_distribution(number - n_variables, state, w.rates, w.still, layout, graphs, w.joint) + 1
@@ -130,7 +129,7 @@ def _split_synchronic(
     w: Work,
     grid: Grid,
 ) -> int:
-    """Draws the late units, each given what the particle became so far; returns how many open units there are."""
+    """Draws variables with synchronic arcs, given each particle's next state so far; returns the new ``n_open``."""
     following, end = np.empty_like(base), len(layout.outputs) - 2
     for i in range(len(synchronic.changing)):
         number = synchronic.changing[i]
@@ -181,7 +180,7 @@ def _list(
 
 @compiled
 def _fill(state: Ints, base: Ints, p: Particles, slot: int, still_open: Ints, n_open: int, layout: Layout, ended: bool) -> bool:
-    """Writes the next state that a particle stands for; returns whether the episode is over."""
+    """Writes the next state that a particle represents; returns whether the episode is over."""
     state[:] = base
     over = ended
     for v in range(n_open):
@@ -191,7 +190,7 @@ def _fill(state: Ints, base: Ints, p: Particles, slot: int, still_open: Ints, n_
 
 @compiled
 def _put(state: Ints, number: int, value: int, layout: Layout, ended: bool) -> bool:
-    """Gives a unit or coupling its value in a next state; returns whether the episode is over."""
+    """Sets the value of a variable or mutex group in a next state; returns whether the episode is over."""
     n_variables = len(layout.outputs)
     if number == n_variables - 2:
         return value == 1
@@ -204,14 +203,14 @@ def _put(state: Ints, number: int, value: int, layout: Layout, ended: bool) -> b
 
 @compiled
 def reset_draws(rate: float, n_grid: int) -> int:
-    """Of ``n_grid`` draws, those that go to the rare event: its share, or a quarter; one at least for each of what can happen."""
+    """Number of ``n_grid`` draws for resets: their share or a quarter, but at least one each for resets and usual steps."""
     if rate <= 0.0 or rate >= 1.0:
         return 0 if rate <= 0.0 else n_grid
     return max(1, min(n_grid - 1, max(n_grid // 4, math.ceil(rate * n_grid))))
 
 
 def mixed(parts: Sequence[tuple[NDArray[np.int64], NDArray[np.float64], Successors]], n_rows: int) -> Successors:
-    """Several kinds of successors of the same rows: of each, which rows [b] it is of, its share of them [b], and what follows."""
+    """A mixture of successors; each part has the numbers of its rows [b], its probability for each row [b], and successors."""
     rows = np.concatenate([which[found.rows] for which, _, found in parts])
     weights = np.concatenate([found.probabilities * share[found.rows] for _, share, found in parts])
     order = np.argsort(rows, kind="stable")
@@ -223,12 +222,12 @@ def mixed(parts: Sequence[tuple[NDArray[np.int64], NDArray[np.float64], Successo
 
 
 class WholeKernel(NamedTuple):
-    """Decision graphs for compiled search, where some units are drawn late, or rare events happen.
+    """Decision graphs for compiled search, for models with resets or synchronic arcs.
 
     Attributes:
         layout, usual, synchronic, reset: see ``fitting.Fitted``; for planning.
-        reset_synchronic: graphs of nothing.
-        has_reset: whether there are rare events.
+        reset_synchronic: graphs of no variable, since resets have no synchronic arcs.
+        has_reset: whether there are resets.
     """
 
     layout: Layout
@@ -240,7 +239,7 @@ class WholeKernel(NamedTuple):
 
 
 def kernel_of(fitted: Fitted, cardinalities: tuple[int, ...]) -> AffectedIndex | WholeKernel:
-    """The kernel of fitted graphs for planning: the lean one where it says everything."""
+    """The kernel of fitted graphs for planning: an ``AffectedIndex`` if possible, else a ``WholeKernel``."""
     if not fitted.has_reset and only_end_is_synchronic(fitted.layout, fitted.synchronic):
         return affected_index(fitted.layout, fitted.usual, fitted.synchronic, cardinalities)
     none = no_synchronic(fitted.reset)
@@ -251,12 +250,12 @@ class WholeWork(NamedTuple):
     """Work space.
 
     Attributes:
-        on: columns, bool [D].
-        values: of the units, int64 [U].
+        on: features, bool [D].
+        values: current values of the variables, int64 [U].
         rates: their distributions, [sum of cardinalities].
-        actions: int64 [A].
-        states: int64 [1, F].
-        reset: number of the event's unit, int64 [1].
+        actions: numbers of all actions, int64 [A].
+        states: the current state, int64 [1, F].
+        reset: number of the variable for resets, int64 [1].
     """
 
     on: Bools
@@ -270,7 +269,7 @@ class WholeWork(NamedTuple):
 @implements(work_for, WholeKernel)
 @compiled
 def whole_work(kernel: WholeKernel, n_grid: int) -> WholeWork:
-    """See compiled_model."""
+    """See ``overloads.work_for``."""
     layout = kernel.layout
     return WholeWork(
         np.empty(n_features(layout), dtype=np.bool_),
@@ -287,7 +286,7 @@ def whole_work(kernel: WholeKernel, n_grid: int) -> WholeWork:
 def whole_outcomes(
     kernel: WholeKernel, work: WholeWork, state: Ints, n_grid: int, key: np.uint64, offset: float, out: Outcomes
 ) -> int:
-    """See compiled_model; every unit is asked."""
+    """See ``overloads.outcomes``; all variables are evaluated."""
     layout, graphs, states, actions, total = kernel.layout, kernel.usual, work.states, work.actions, 0
     states[:] = state
     for action in range(len(layout.encoding.action_class)):
@@ -316,14 +315,14 @@ def whole_outcomes(
 
 @compiled
 def _leave_out(layout: Layout, state: Ints, first: int, n: int, out: Outcomes) -> int:
-    """Takes what breaks a law out of the last ``n`` outcomes; returns how many are left."""
+    """Removes outcomes that violate an invariant from the last ``n``; returns how many are left."""
     counts, observed, weights, cells = layout.counts, layout.observed, layout.weights, layout.cells
     return leave_out(counts, observed, weights, cells, state, out.states, out.terminated, out.probabilities, first, n)
 
 
 @compiled
 def _take(states: Ints, terminated: Bools, probabilities: Floats, share: float, total: int, out: Outcomes) -> int:
-    """Takes outcomes over, from number ``total`` on, which have a share of all; returns how many."""
+    """Copies outcomes, which have a share of the probability, to ``out`` from number ``total`` on; returns how many."""
     for q in range(len(states)):
         out.states[total + q] = states[q]
         out.terminated[total + q] = terminated[q]

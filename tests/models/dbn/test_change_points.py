@@ -1,4 +1,4 @@
-"""Rules that change: only what changed is learned anew, and what stays loses nothing."""
+"""Change points: only changed variables are learned again, and all others keep their data."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ RNG = np.random.default_rng(0)
 
 
 def switches(n: int, changed_at: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Bit 0 copies bit 1, and from some step on its opposite; bit 2 copies bit 3 for ever; the others are coins."""
+    """Bit 0 copies bit 1, and from a given step on its negation; bit 2 always copies bit 3; the others are coins."""
     states, actions = RNG.integers(2, size=(n, 4)), RNG.integers(2, size=n)
     following = RNG.integers(2, size=(n, 4))
     following[:, 0] = states[:, 1] ^ (np.arange(n) >= changed_at)
@@ -27,7 +27,7 @@ def since_of(data: TransitionDataset) -> np.ndarray:
     return DecisionGraphModel(data.cardinalities, 2)._since(rows, np.zeros(len(rows), dtype=np.bool_))
 
 
-def test_a_changed_rule_is_followed_and_others_keep_all_their_data() -> None:
+def test_changed_variable_follows_its_new_rule_and_others_keep_all_data() -> None:
     data = dataset((2,) * 4, 2, *switches(4000, 3500))
     model = DecisionGraphModel((2,) * 4, 2)
     report = model.fit(data)
@@ -38,12 +38,12 @@ def test_a_changed_rule_is_followed_and_others_keep_all_their_data() -> None:
     assert report.exact_match is not None
 
 
-def test_nothing_is_forgotten_where_nothing_changed() -> None:
+def test_no_data_are_ignored_if_nothing_changed() -> None:
     model = DecisionGraphModel((2,) * 4, 2)
     assert model.fit(dataset((2,) * 4, 2, *switches(4000, 4000))).log["changed"] == 0
 
 
-def test_planes_follow_a_change_too() -> None:
+def test_planes_follow_a_change() -> None:
     n, space = 2500, FactoredSpace(spaces.MultiBinary((1, 4, 5)))
     states = (RNG.random((n, 1, 4, 5)) < 0.3).astype(np.int64)
     following = np.zeros_like(states)
@@ -56,20 +56,20 @@ def test_planes_follow_a_change_too() -> None:
     np.testing.assert_array_equal(found, following[-300:].reshape(300, -1))
 
 
-def test_the_longest_past_that_still_holds_is_kept() -> None:
+def test_all_steps_since_the_change_are_kept() -> None:
     rows = dataset((2,) * 4, 2, *switches(6000, 4000)).rows()
     since = last_changes(rows, 5, DecisionGraphModel((2,) * 4, 2)._factor_log_probs)
     assert 4000 <= since[0] <= 4020
     assert (since[1:] == 0).all()
 
 
-def test_fifty_steps_of_a_new_rule_are_enough() -> None:
+def test_fifty_steps_of_a_new_rule_are_detected() -> None:
     since = since_of(dataset((2,) * 4, 2, *switches(3050, 3000)))
     assert 3000 <= since[0] <= 3010
     assert (since[1:] == 0).all()
 
 
-def test_variables_that_changed_one_after_another_each_have_their_step() -> None:
+def test_variables_that_changed_at_different_steps_have_separate_change_points() -> None:
     states, actions, following = switches(4000, 3500)
     following[3900:, 2] ^= 1
     since = since_of(dataset((2,) * 4, 2, states, actions, following))
@@ -78,7 +78,7 @@ def test_variables_that_changed_one_after_another_each_have_their_step() -> None
     assert (since[[1, 3, 4]] == 0).all()
 
 
-def test_what_only_becomes_predictable_is_found_in_long_runs() -> None:
+def test_random_variable_that_becomes_predictable_is_detected_in_long_runs() -> None:
     states, actions, following = switches(4000, 4000)
     following[3300:, 1] = states[3300:, 3]  # a coin before
     since = since_of(dataset((2,) * 4, 2, states, actions, following))
@@ -86,7 +86,7 @@ def test_what_only_becomes_predictable_is_found_in_long_runs() -> None:
     assert (since[[0, 2, 3, 4]] == 0).all()
 
 
-def test_states_never_met_before_are_no_change_of_rules() -> None:
+def test_states_never_observed_before_are_no_change_point() -> None:
     states, actions, following = switches(4000, 4000)
     rng = np.random.default_rng(5)
     place = np.where(np.arange(4000) < 3900, rng.integers(4, size=4000), 4 + rng.integers(4, size=4000))
@@ -95,7 +95,7 @@ def test_states_never_met_before_are_no_change_of_rules() -> None:
     assert (since_of(dataset((8, 2, 2, 2), 2, states, actions, following)) == 0).all()
 
 
-def test_a_report_after_a_change_holds_out_new_steps_even_of_one_long_episode() -> None:
+def test_steps_after_a_change_are_held_out_even_from_a_single_episode() -> None:
     rows = dataset((2,) * 4, 2, *switches(4000, 2500), episode_length=4000)
     report = DecisionGraphModel((2,) * 4, 2).fit(rows)
     assert report.log["changed"] == 1

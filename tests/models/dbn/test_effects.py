@@ -1,4 +1,4 @@
-"""Sums of a factor's value and the action's number, less what luck takes, within bounds."""
+"""Sums of a factor's value and the action's number, with random deviations, within bounds."""
 
 import numpy as np
 import pytest
@@ -15,44 +15,44 @@ LAST, ORDERS, DEMAND = 12, 6, 3.0
 EVERY = np.stack(np.meshgrid(np.arange(LAST + 1), np.arange(ORDERS), indexing="ij"), axis=-1).reshape(-1, 2)
 
 
-def following(effect: Effect, value: Ints, action: Ints, uniform: Ints) -> Ints:
-    """What comes of a stock that orders fill and demand empties, or of a queue that is served and that luck makes longer."""
+def following(effect: Effect, value: Ints, action: Ints, noise: Ints) -> Ints:
+    """Next level of a stock that orders increase and random demand decreases, or of a queue with service and random arrivals."""
     stocks = effect in (Effect.SUM, Effect.CLIPPED_SUM)
     level = value + action if stocks else value - action
-    if effect in (Effect.CLIPPED_SUM, Effect.CLIPPED_DIFFERENCE):  # what there is no room for is gone before luck comes
+    if effect in (Effect.CLIPPED_SUM, Effect.CLIPPED_DIFFERENCE):  # the sum is clipped before the noise is added
         level = level.clip(0, LAST)
-    after: Ints = np.clip(level - uniform if stocks else level + uniform, 0, LAST)
+    after: Ints = np.clip(level - noise if stocks else level + noise, 0, LAST)
     return after
 
 
-def world(n: int, effect: Effect) -> tuple[Ints, Ints, Ints]:
-    """Transitions of one."""
+def transitions(n: int, effect: Effect) -> tuple[Ints, Ints, Ints]:
+    """Random states [n, 1], actions [n] and next states [n, 1]."""
     rng = np.random.default_rng(0)
     value, action = rng.integers(LAST + 1, size=n), rng.integers(ORDERS, size=n)
     return value[:, None], action, following(effect, value, action, rng.poisson(DEMAND, n))[:, None]
 
 
 def truth(effect: Effect) -> NDArray[np.float64]:
-    """Distribution of what follows every pair (value, action), [pairs, values]."""
+    """True distribution of the next value for every pair (value, action), [pairs, values]."""
     probs = np.zeros((len(EVERY), LAST + 1))
-    for uniform in range(60):
-        after = following(effect, EVERY[:, 0], EVERY[:, 1], np.full(len(EVERY), uniform))
-        probs[np.arange(len(EVERY)), after] += stats.poisson.pmf(uniform, DEMAND)
+    for noise in range(60):
+        after = following(effect, EVERY[:, 0], EVERY[:, 1], np.full(len(EVERY), noise))
+        probs[np.arange(len(EVERY)), after] += stats.poisson.pmf(noise, DEMAND)
     return probs
 
 
-@pytest.mark.parametrize("manner", SUM_EFFECTS)
+@pytest.mark.parametrize("effect", SUM_EFFECTS)
 @pytest.mark.parametrize(("n", "mean", "most"), [(500, 0.1, 0.5), (1500, 0.06, 0.15)])
-def test_stocks_and_queues_are_known_from_few_transitions(effect: Effect, n: int, mean: float, most: float) -> None:
+def test_stocks_and_queues_are_learned_from_few_transitions(effect: Effect, n: int, mean: float, most: float) -> None:
     model = DecisionGraphModel((LAST + 1,), ORDERS)
-    model.fit(dataset((LAST + 1,), ORDERS, *world(n, effect)))
+    model.fit(dataset((LAST + 1,), ORDERS, *transitions(n, effect)))
     found = model.marginals(EVERY[:, :1], EVERY[:, 1])[:, : LAST + 1]
     distance = 0.5 * np.abs(found - truth(effect)).sum(axis=1)
-    assert distance.mean() < mean  # 1,500 transitions are 19 of each pair, whose frequencies are .2 away
+    assert distance.mean() < mean  # 1,500 transitions are 19 of each pair; their frequencies have a distance of 0.2
     assert distance.max() < most
 
 
-def test_numbers_of_actions_that_mean_nothing_are_not_added() -> None:
+def test_arbitrary_numbers_of_actions_are_not_added() -> None:
     rng = np.random.default_rng(1)
     states, actions = rng.integers(9, size=(1500, 1)), rng.integers(5, size=1500)
     step = np.array([2, -1, 0, 1, -2])[actions] * rng.integers(2, size=1500)
@@ -65,26 +65,26 @@ def test_numbers_of_actions_that_mean_nothing_are_not_added() -> None:
         expected[i, i // 5] += 0.5
         expected[i, (i // 5 + moves[i % 5]) % 9] += 0.5
     distance = 0.5 * np.abs(probs - expected).sum(axis=1)
-    assert distance.mean() < 0.04  # a rate of 300 coins is .03 off
+    assert distance.mean() < 0.04  # the standard error of a rate from 300 coins is 0.03
 
 
-def test_questions_of_sums_cover_every_value_but_the_present_one_once() -> None:
-    now, actions, then = (part.ravel() for part in world(4000, Effect.SUM))
+def test_questions_of_sums_cover_every_value_but_the_current_one_once() -> None:
+    now, actions, then = (part.ravel() for part in transitions(4000, Effect.SUM))
     pair = actions * (LAST + 1) + now
-    asked = questions_for_effect(Effect.SUM, 0, LAST + 1, ORDERS, Observed(pair, actions, now, then))
-    entries = np.concatenate([np.stack([question.pairs, question.values], axis=1) for question in asked])
+    questions = questions_for_effect(Effect.SUM, 0, LAST + 1, ORDERS, Observed(pair, actions, now, then))
+    entries = np.concatenate([np.stack([question.pairs, question.values], axis=1) for question in questions])
     assert len(np.unique(entries, axis=0)) == len(entries)
     assert (entries[:, 0] % (LAST + 1) != entries[:, 1]).all()
     assert (entries[:, 1].min(), entries[:, 1].max()) == (0, LAST)
-    met = np.unique(np.stack([pair, then], axis=1)[now != then], axis=0)
-    assert {tuple(row) for row in met.tolist()} <= {tuple(row) for row in entries.tolist()}
-    bound = [question for question in asked if len(np.unique(question.values)) == 1 and question.values[0] == 0][-1]
+    observed = np.unique(np.stack([pair, then], axis=1)[now != then], axis=0)
+    assert {tuple(row) for row in observed.tolist()} <= {tuple(row) for row in entries.tolist()}
+    bound = [question for question in questions if len(np.unique(question.values)) == 1 and question.values[0] == 0][-1]
     assert bound.target.context.max() + 1 == LAST + ORDERS  # one for each sum
     assert (bound.target.positives.sum(), bound.target.counts.sum()) == ((then == 0).sum(), len(then))
 
 
-def test_orders_that_were_never_made_are_known_from_those_that_were() -> None:
-    states, actions, after = world(5000, Effect.SUM)
+def test_unobserved_orders_are_predicted_from_observed_ones() -> None:
+    states, actions, after = transitions(5000, Effect.SUM)
     some = actions < ORDERS - 1
     model = DecisionGraphModel((LAST + 1,), ORDERS)
     model.fit(dataset((LAST + 1,), ORDERS, states[some], actions[some], after[some]))

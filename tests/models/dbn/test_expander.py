@@ -1,4 +1,4 @@
-"""Decision graphs in compiled search: the same imagined world as by the model's own successors, for any kind of model."""
+"""Decision graphs in compiled search: the same state graph as from the model's own successors, for any kind of model."""
 
 from collections.abc import Callable
 
@@ -28,7 +28,7 @@ def of_game(game: Game) -> tuple[DecisionGraphModel, np.ndarray]:
     return model, data.rows().states
 
 
-def of_games_bits(game: Game) -> tuple[DecisionGraphModel, np.ndarray]:
+def of_game_as_bits(game: Game) -> tuple[DecisionGraphModel, np.ndarray]:
     data = played(game, 3000, 100)
     model = DecisionGraphModel(data.cardinalities, int(game.action_space.n))
     model.fit(data)
@@ -43,7 +43,7 @@ def of_small_world() -> tuple[DecisionGraphModel, np.ndarray]:
 
 
 def of_walker() -> tuple[DecisionGraphModel, np.ndarray]:
-    """A walker that goes up or down, or right under action 1, by chance; on the target it is over, but for one time in four."""
+    """A random walker: up or down, or right under action 1; on the target, the episode ends with probability 3/4."""
     rng, rows, place = np.random.default_rng(0), [], (0, 0)
     target = np.zeros((4, 4), dtype=np.int64)
     target[2, 3] = 1
@@ -65,7 +65,7 @@ def of_walker() -> tuple[DecisionGraphModel, np.ndarray]:
     return model, states
 
 
-def test_an_end_that_hangs_on_what_comes_is_still_lean() -> None:
+def test_affected_variables_are_used_if_only_the_end_is_synchronic() -> None:
     model, _ = of_walker()
     kernel = model.kernel()
     assert isinstance(kernel, AffectedIndex)
@@ -75,12 +75,12 @@ def test_an_end_that_hangs_on_what_comes_is_still_lean() -> None:
 
 WORLDS: dict[str, Callable[[], tuple[DecisionGraphModel, np.ndarray]]] = {
     "planes with redraws": lambda: of_game(Maneuverer(size=4)),
-    "planes with luck": lambda: of_game(FlierCatcher(height=4, width=5)),
+    "planes with noise": lambda: of_game(FlierCatcher(height=4, width=5)),
     "groups": lambda: of_game(GeyserRunner()),
-    "rare events": lambda: of_games_bits(Maneuverer(size=4)),
+    "resets": lambda: of_game_as_bits(Maneuverer(size=4)),
     "wheels and ends": of_small_world,
-    "ends by chance where something comes": of_walker,
-    "planes with laws": fitted,
+    "random ends in some next states": of_walker,
+    "planes with invariants": fitted,
 }
 
 
@@ -92,7 +92,7 @@ def edges(graph: StateGraph, node: int) -> list[tuple[int, bytes, bool, float]]:
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_compiled_expansion_is_that_of_the_successors(name: str) -> None:
+def test_compiled_expansion_equals_the_successors(name: str) -> None:
     model, states = WORLDS[name]()
     roots = np.unique(states[::7], axis=0)[:60]
     compiled, plain = StateGraph(model), StateGraph(model)
@@ -109,7 +109,7 @@ def test_compiled_expansion_is_that_of_the_successors(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_compiled_lookahead_is_that_of_any_model(name: str) -> None:
+def test_compiled_lookahead_equals_the_general_one(name: str) -> None:
     model, states = WORLDS[name]()
     roots = states[[0, 40, 80]]
     graphs = []
@@ -119,14 +119,14 @@ def test_compiled_lookahead_is_that_of_any_model(name: str) -> None:
         grow_lookahead(graph, graph.add(roots, np.arange(3)), max_states=50, n_samples=4, horizon=12, seed=5)
         graphs.append(graph)
     for group in range(3):
-        worlds = [
+        expanded = [
             {g.states[node].tobytes(): edges(g, int(node)) for node in np.flatnonzero(g.expanded & (g.groups == group))}
             for g in graphs
         ]
-        assert worlds[0] == worlds[1]
+        assert expanded[0] == expanded[1]
 
 
-def test_a_graph_that_was_cleared_is_as_new() -> None:
+def test_cleared_state_graph_equals_a_new_one() -> None:
     model, states = WORLDS["groups"]()
     graph = StateGraph(model)
     for _ in range(3):
@@ -138,9 +138,9 @@ def test_a_graph_that_was_cleared_is_as_new() -> None:
     assert graph.find(states[:1])[0] == 0
 
 
-def test_many_states_that_are_equally_likely_are_expanded_together() -> None:
-    # One step draws five wheels and sets a sixth, which stay from then on: 96 states that are alike, more than there is room for
-    # at first.
+def test_many_equally_probable_states_are_expanded_together() -> None:
+    # One step draws five wheels and sets a sixth, which keep their values from then on: 96 equally probable states, more than fit
+    # into the arrays at first.
     rng = np.random.default_rng(0)
     states, actions = rng.integers(3, size=(4000, 7)), rng.integers(3, size=4000)
     states[:, 6] = rng.integers(2, size=4000)

@@ -1,4 +1,4 @@
-"""Actions with parts: what one part does is learned from few steps, and holds for actions that were never taken."""
+"""Actions with components: the effect of one component is learned from few steps, and generalises to actions never taken."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def pressed(actions: NDArray[np.int64], switch: int) -> NDArray[np.int64]:
     return on
 
 
-def test_columns_are_the_parts_of_the_actions_that_a_space_enumerates() -> None:
+def test_features_are_the_components_of_enumerated_actions() -> None:
     enumerated = ActionEnumeration(spaces.MultiDiscrete([2, 3, 2]))
     parts = enumerated.decode(np.arange(enumerated.n))
     expected = np.stack([parts[:, 0] == 1, *(parts[:, 1] == v for v in range(3)), parts[:, 2] == 1], axis=1)
@@ -30,7 +30,7 @@ def test_columns_are_the_parts_of_the_actions_that_a_space_enumerates() -> None:
     assert np.array_equal(action_feature_table(action_encoding((4,)), np.arange(4)), np.eye(4, dtype=bool))
 
 
-def test_one_switch_of_eight_is_learned_from_few_steps_and_for_actions_never_taken() -> None:
+def test_one_of_eight_switches_is_learned_from_few_steps_also_for_actions_never_taken() -> None:
     rng = np.random.default_rng(0)
     states, actions = rng.integers(2, size=(300, 2)), rng.integers(256, size=300)
     following = np.stack([states[:, 0] ^ pressed(actions, 2), states[:, 0]], axis=1)
@@ -47,7 +47,7 @@ def test_one_switch_of_eight_is_learned_from_few_steps_and_for_actions_never_tak
     assert not np.array_equal(whole.likeliest(tests, every)[0], expected)
 
 
-def test_compiled_search_sees_the_same_outcomes_as_the_model() -> None:
+def test_compiled_search_has_the_same_outcomes_as_the_model() -> None:
     rng = np.random.default_rng(1)
     states, actions = np.stack([rng.integers(5, size=600), rng.integers(2, size=600)], axis=1), rng.integers(256, size=600)
     place = (states[:, 0] + pressed(actions, 0) - pressed(actions, 5)).clip(0, 4)
@@ -63,7 +63,7 @@ def test_compiled_search_sees_the_same_outcomes_as_the_model() -> None:
     assert graph.probabilities == pytest.approx(found.probabilities)
 
 
-def test_planes_learn_parts_too_and_weights_come_back() -> None:
+def test_planes_learn_action_components_and_weights_are_restored() -> None:
     rng = np.random.default_rng(2)
     space = FactoredSpace(spaces.MultiBinary((1, 3, 3)))
     states, actions = rng.integers(2, size=(300, 9)), rng.integers(256, size=300)
@@ -79,6 +79,6 @@ def test_planes_learn_parts_too_and_weights_come_back() -> None:
         LocalGraphModel(space, 256).load_state_dict(model.state_dict())
 
 
-def test_parts_must_make_the_actions() -> None:
-    with pytest.raises(ValueError, match="are 256, not 255"):
+def test_parts_that_do_not_multiply_to_the_number_of_actions_raise() -> None:
+    with pytest.raises(ValueError, match="make 256 actions, not 255"):
         DecisionGraphModel((2,), 255, parts=SWITCHES)

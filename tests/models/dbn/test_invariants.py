@@ -1,4 +1,4 @@
-"""Laws of planes: what is found, what is left out, and that no draw breaks what is kept."""
+"""Invariants of planes: which are found, which outcomes are removed, and that no sample violates them."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ SPACE = FactoredSpace(spaces.MultiDiscrete(np.broadcast_to([[[KINDS]], [[COLOURS
 
 
 def crowd(n: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """A red ball (1, 1) and a blue box (2, 3) that step to a free neighbouring cell by chance; action 1 may end it all."""
+    """A red ball (1, 1) and a blue box (2, 3) that move to random free neighbouring cells; action 1 may end the episode."""
     rng, rows = np.random.default_rng(seed), []
     places = [(0, 0), (2, 2)]
 
@@ -36,7 +36,7 @@ def crowd(n: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
         over = action == 1 and rng.random() < 0.05
         after = show()
         if over:
-            after[:] = 0  # nothing holds for the last state
+            after[:] = 0  # the last state violates all invariants
         rows.append((before, action, after, over))
         if over:
             places = [(0, 0), (2, 2)]
@@ -62,7 +62,7 @@ def test_counts_and_combinations_are_found() -> None:
     assert len(few.counts) == 0
 
 
-def test_new_combinations_that_keep_coming_are_no_law() -> None:
+def test_combinations_are_no_invariant_while_new_ones_are_observed() -> None:
     rng, n = np.random.default_rng(0), 300
     before = rng.integers(20, size=(n, 2 * SIZE * SIZE))
     space = FactoredSpace(spaces.MultiDiscrete(np.full((2, SIZE, SIZE), 20)))
@@ -71,7 +71,7 @@ def test_new_combinations_that_keep_coming_are_no_law() -> None:
     assert find_invariants(rows, space.planes, (20, 20)).none
 
 
-def test_what_breaks_a_law_is_left_out_and_the_others_share_its_probability() -> None:
+def test_outcomes_that_violate_an_invariant_are_removed_and_others_renormalised() -> None:
     cells, weights = np.arange(2).reshape(1, 1, 2), radix((3,))
     invariants = NO_INVARIANTS._replace(counts=np.array([[0, 1]]))
     states = np.array([[1, 0], [0, 0]])
@@ -83,10 +83,10 @@ def test_what_breaks_a_law_is_left_out_and_the_others_share_its_probability() ->
     np.testing.assert_array_equal(kept.states, [[1, 0], [0, 1], [0, 0], [0, 0]])
     np.testing.assert_allclose(kept.probabilities, [0.2, 0.6, 0.2, 1.0])
     impossible = invariants._replace(observed=np.array([False, False, True]))
-    assert len(enforced(impossible, weights, cells, states, found).states) == 6  # no outcome keeps it: all stay
+    assert len(enforced(impossible, weights, cells, states, found).states) == 6  # no outcome satisfies it: none is removed
 
 
-def test_draws_keep_the_laws_and_are_told_their_probability() -> None:
+def test_samples_satisfy_the_invariants_and_probabilities_take_them_into_account() -> None:
     model, states = fitted()
     layout, rng = model.fitted.layout, np.random.default_rng(0)
     assert len(layout.counts) > 0
@@ -100,13 +100,13 @@ def test_draws_keep_the_laws_and_are_told_their_probability() -> None:
     determined = np.exp(model.log_prob(some[rows], actions[rows], found.states, found.terminated))
     totals = np.bincount(rows, weights=determined)
     assert totals.max() < 1.05
-    assert totals.min() > 0.6  # 256 draws do not meet all that may happen
+    assert totals.min() > 0.6  # 256 draws do not cover all possible outcomes
     broken = some[:1].copy()
     broken[0, 0] = 1 - broken[0, 0]
     assert model.log_prob(some[:1], actions[:1], broken, np.array([False]))[0] == -np.inf
 
 
-def test_draws_do_not_hang_on_the_rows_beside_them() -> None:
+def test_samples_do_not_depend_on_other_rows() -> None:
     model, states = fitted()
     keys = np.arange(60, dtype=np.uint64)
     together = model.sample(states[:60], np.zeros(60, dtype=np.int64), keys)
@@ -115,19 +115,19 @@ def test_draws_do_not_hang_on_the_rows_beside_them() -> None:
         np.testing.assert_array_equal(alone[0][0], together[0][b])
 
 
-def test_laws_are_saved_and_damaged_ones_refused() -> None:
+def test_invariants_are_saved_and_damaged_ones_refused() -> None:
     model, states = fitted()
     other = LocalGraphModel(SPACE, 2)
     weights = model.state_dict()
     other.load_state_dict(weights)
     np.testing.assert_array_equal(other.fitted.layout.counts, model.fitted.layout.counts)
     actions = np.zeros(100, dtype=np.int64)
-    for mine, theirs in zip(
+    for expected, found in zip(
         model.sample(states[:100], actions, np.random.default_rng(1)),
         other.sample(states[:100], actions, np.random.default_rng(1)),
         strict=True,
     ):
-        np.testing.assert_array_equal(mine, theirs)
+        np.testing.assert_array_equal(expected, found)
     for name, array in (("counts", np.array([[0, 9]])), ("met", np.ones(5, dtype=np.bool_))):
         with pytest.raises(ValueError, match="planes do not have"):
             other.load_state_dict({**weights, name: array})
@@ -136,6 +136,6 @@ def test_laws_are_saved_and_damaged_ones_refused() -> None:
     np.testing.assert_array_equal(carried.fitted.layout.counts, model.fitted.layout.counts)
 
 
-def test_no_laws_cost_nothing() -> None:
+def test_none_indicates_missing_invariants() -> None:
     assert NO_INVARIANTS.none
     assert not Invariants(np.array([[0, 1]]), NO_INVARIANTS.observed).none

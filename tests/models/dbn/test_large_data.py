@@ -1,4 +1,4 @@
-"""More transitions than can be searched at once: counted in parts, and searched where they disagree."""
+"""More transitions than can be searched at once: all are counted in parts, and contexts with both outcomes are searched."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from mbagent_envs import Maneuverer
 from tests.models.helpers import played
 
 
-def test_columns_of_some_cells_are_those_of_all() -> None:
+def test_features_of_some_cells_equal_those_of_all_cells() -> None:
     rng = np.random.default_rng(0)
     planes, actions = rng.integers(2, size=(6, 2, 3, 5)).astype(np.uint8), rng.integers(3, size=6)
     features = relative_features((2, 2), (3,), Reach(1, wrap=True))
@@ -30,7 +30,7 @@ def test_columns_of_some_cells_are_those_of_all() -> None:
 
 
 @pytest.fixture
-def little_room(monkeypatch: pytest.MonkeyPatch) -> None:
+def small_tables(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("MOST_TABLE_ENTRIES", "QUICK_CELLS"):
         monkeypatch.setattr(large_data, name, 60_000)
     monkeypatch.setattr(large_data, "ENTRIES_PER_CHUNK", 100_000)
@@ -45,21 +45,21 @@ def likeliest(data: TransitionDataset, tests: TransitionBatch) -> tuple[LocalGra
     return model, model.likeliest(tests.states, tests.actions)
 
 
-def test_as_much_is_learned_with_little_room(request: pytest.FixtureRequest) -> None:
+def test_small_tables_give_the_same_predictions(request: pytest.FixtureRequest) -> None:
     game = Maneuverer(size=4)
     data, tests = played(game, 2000, 100), played(game, 1000, 100, seed=1).rows()
     model, (states, _) = likeliest(data, tests)
     assert model.fitted.found[0].target.counts.sum() == 2000 * 16
-    request.getfixturevalue("little_room")
+    request.getfixturevalue("small_tables")
     smaller, (others, _) = likeliest(data, tests)
-    assert smaller.fitted.found[0].target.counts.sum() == 2000 * 16  # all were counted, though few were searched
+    assert smaller.fitted.found[0].target.counts.sum() == 2000 * 16  # all were counted, although few were searched
     assert (states == others).all(axis=1).mean() > 0.99
     again, _ = likeliest(data, tests)
     assert all(np.array_equal(again.state_dict()[name], part) for name, part in smaller.state_dict().items())
 
 
 class Drift(gym.Env[Any, Any]):
-    """A dot that moves one column to the right, around the board, every third step: the past tells when."""
+    """A dot that moves one column to the right every third step, with wrap-around; only the past shows when it moves next."""
 
     observation_space = spaces.MultiBinary((1, 5, 5))
     action_space = spaces.Discrete(2)
@@ -79,8 +79,8 @@ class Drift(gym.Env[Any, Any]):
         return self._shown(), 0.0, False, False, {}
 
 
-@pytest.mark.usefixtures("little_room")
-def test_a_past_is_copied_and_tells_when_things_move() -> None:
+@pytest.mark.usefixtures("small_tables")
+def test_past_channels_are_copied_and_predict_moves() -> None:
     env = History(Drift(), 3)
     space, rng, rows = FactoredSpace(env.observation_space), np.random.default_rng(0), []
     for episode in range(20):
@@ -97,12 +97,12 @@ def test_a_past_is_copied_and_tells_when_things_move() -> None:
     model = LocalGraphModel(space, 2, Reach(1, wrap=True))
     model.fit(data, seed=0)
     found, _ = model.likeliest(states, actions)
-    synchronic = np.arange(len(rows)) % 40 >= 3  # before, the past shows the first observation again and again
-    assert (found == after).all(axis=1)[synchronic].all()
+    full_history = np.arange(len(rows)) % 40 >= 3  # before, the past repeats the first observation
+    assert (found == after).all(axis=1)[full_history].all()
 
 
 @pytest.mark.parametrize("flat", [False, True])
-def test_rows_in_files_teach_the_same(flat: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_in_files_give_the_same_model(flat: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(data_module, "_MAPPED", 1000)
     space = FactoredSpace(Maneuverer(size=3).observation_space)
     rows, fitted = played(Maneuverer(size=3), 400, 20).rows(), []
@@ -116,7 +116,7 @@ def test_rows_in_files_teach_the_same(flat: bool, tmp_path: Path, monkeypatch: p
     assert all(np.array_equal(fitted[0][name], fitted[1][name]) for name in fitted[0])
 
 
-def test_what_was_left_out_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_ignored_rows_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(graph_model, "MOST_VALUES", 27 * 200)
     monkeypatch.setattr(large_data, "MOST_CELLS_COUNTED", 27 * 150)
     space, data = FactoredSpace(Maneuverer(size=3).observation_space), played(Maneuverer(size=3), 400, 20)

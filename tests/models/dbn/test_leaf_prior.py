@@ -12,7 +12,7 @@ UNEQUAL = MixedPrior(0.5, MIXED_STRENGTH, np.arange(1.0, len(CENTRES) + 1) / np.
 
 
 def leaves(n: Ints, e: Ints) -> list[Search]:
-    """One head whose leaves have these counts."""
+    """One target whose leaves have these counts."""
     each = np.arange(len(n))
     return [Search(Target(each, n, e, each, each, np.zeros_like(each)))]
 
@@ -31,7 +31,7 @@ def test_outcomes_have_probabilities_that_sum_to_one(prior: LeafPrior, n: int) -
     assert ((slab >= 0.0) & (slab <= 1.0)).all()
 
 
-def test_the_next_outcome_comes_at_the_rate_of_the_leaf() -> None:
+def test_rate_is_the_predictive_probability_of_the_next_outcome() -> None:
     """A posterior mean is a ratio of evidences."""
     n, e, prior_mean = np.array([0, 5, 40]), np.array([0, 2, 39]), np.array([0.5, 0.2, 0.9])
     for prior in (LeafPrior(0.3, 1.0), UNEQUAL):
@@ -46,8 +46,8 @@ def test_equal_weights_are_the_simple_prior() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_few_kinds_of_luck_are_told_from_the_luck_of_few_rows(seed: int) -> None:
-    """Leaves of 35 rows whose rates are 0.02 or 0.97; a quarter as far from the truth as with the simple prior, at most."""
+def test_few_different_rates_are_separated_from_sampling_noise(seed: int) -> None:
+    """Leaves of 35 rows whose rates are 0.02 or 0.97; the squared error is at most a quarter of that with the simple prior."""
     rates = np.where(np.random.default_rng(seed).random(500) < 0.5, 0.02, 0.97)
     n, e = drawn(rates, 35, seed)
     found = leaves(n, e)
@@ -56,7 +56,7 @@ def test_few_kinds_of_luck_are_told_from_the_luck_of_few_rows(seed: int) -> None
     assert errors[1] < 0.25 * errors[0]
 
 
-def test_rates_of_all_kinds_stay_what_they_are() -> None:
+def test_uniform_rates_are_not_distorted() -> None:
     rates = np.random.default_rng(0).random(500)
     for rows in (5, 50, 5000):
         n, e = drawn(rates, rows, 0)
@@ -65,7 +65,7 @@ def test_rates_of_all_kinds_stay_what_they_are() -> None:
         assert np.square(fitted - rates).mean() < 1.05 * np.square(simple - rates).mean()
 
 
-def test_without_clear_evidence_the_simple_prior_stays() -> None:
+def test_simple_prior_is_kept_without_clear_evidence() -> None:
     certain = np.arange(200) % 2
     for n, e in (drawn(np.full(8, 0.1), 10, 0), (np.full(200, 30), 30 * certain), (np.zeros(3, int), np.zeros(3, int))):
         assert not isinstance(fitted_prior(leaves(n, e)), MixedPrior)

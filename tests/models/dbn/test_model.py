@@ -1,4 +1,4 @@
-"""Decision graphs as a transition model: laws of its probabilities, worlds learned exactly, files."""
+"""Decision graphs as a transition model: properties of its probabilities, environments learned exactly, files."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -38,7 +38,7 @@ def model() -> DecisionGraphModel:
     return fitted
 
 
-def test_probabilities_sum_to_one_and_are_those_of_the_draws_and_of_the_successors(model: DecisionGraphModel) -> None:
+def test_probabilities_sum_to_one_and_agree_with_samples_and_successors(model: DecisionGraphModel) -> None:
     possible, ends = outcomes(CARDINALITIES)
     states, actions, _, _ = small_world(12, 1)
     for state, action in zip(states, actions, strict=True):
@@ -58,7 +58,7 @@ def test_probabilities_sum_to_one_and_are_those_of_the_draws_and_of_the_successo
         np.testing.assert_allclose(listed.probabilities, kept / kept.sum(), atol=1e-6)
 
 
-def test_a_small_world_is_learned_with_its_causes(model: DecisionGraphModel) -> None:
+def test_dependencies_of_a_small_world_are_learned(model: DecisionGraphModel) -> None:
     possible, ends = outcomes(CARDINALITIES)
     state = np.array([1, 1, 0, 0, 1])
     probs = np.exp(model.log_prob(np.tile(state, (len(ends), 1)), np.ones(len(ends), dtype=np.int64), possible, ends))
@@ -67,10 +67,10 @@ def test_a_small_world_is_learned_with_its_causes(model: DecisionGraphModel) -> 
     assert probs[turned][0] == pytest.approx(0.7, abs=0.04)
     assert probs[turned][0] + probs[slipped][0] > 0.995
     _, over = model.likeliest(np.array([[0, 2, 0, 1, 0], [0, 2, 0, 1, 0]]), np.array([0, 1]))
-    assert over.tolist() == [True, False]  # wheel at 2 and place at 1: neither alone
+    assert over.tolist() == [True, False]  # wheel at 2 and place at 1: neither is enough alone
 
 
-def test_marginals_are_those_of_the_exact_distribution(model: DecisionGraphModel) -> None:
+def test_marginals_agree_with_the_joint_distribution(model: DecisionGraphModel) -> None:
     possible, ends = outcomes(CARDINALITIES)
     states, actions, _, _ = small_world(5, 2)
     found = model.marginals(states, actions)
@@ -125,7 +125,7 @@ def test_flat_bits_that_exclude_each_other_are_drawn_together() -> None:
     assert abs(spawned.mean() - 0.4) < 5 * np.sqrt(0.24 / 2000)
 
 
-def test_weights_come_back_and_damaged_ones_are_refused(model: DecisionGraphModel) -> None:
+def test_weights_are_restored_and_damaged_ones_refused(model: DecisionGraphModel) -> None:
     other = DecisionGraphModel(CARDINALITIES, 2)
     other.load_state_dict(model.state_dict())
     states, actions, _, _ = small_world(100, 4)
@@ -150,13 +150,13 @@ def test_weights_come_back_and_damaged_ones_are_refused(model: DecisionGraphMode
         assert all(np.array_equal(value, good[name]) for name, value in other.state_dict().items())
 
 
-def test_an_unfitted_model_expects_nothing_to_change() -> None:
+def test_unfitted_model_predicts_no_change() -> None:
     fresh = DecisionGraphModel((2, 3), 2)
     states = np.array([[1, 2], [0, 1]])
     np.testing.assert_array_equal(fresh.sample(states, np.array([0, 1]), derive(1, np.arange(2)))[0], states)
 
 
-def test_an_agent_plans_on_decision_graphs_and_is_saved_with_them(tmp_path: Path) -> None:
+def test_agent_plans_with_decision_graphs_and_saves_them(tmp_path: Path) -> None:
     env = gym.make("mbagent/GeyserRunner-v0", mode="deterministic")
     agent = ModelLearningAgent("MctsPolicy", env, model="graphs", seed=0)
     agent.learn(1500)

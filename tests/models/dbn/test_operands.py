@@ -1,4 +1,4 @@
-"""Sums of a factor's value with a part of the action, or with another factor's value."""
+"""Sums of a factor's value and an action component or another factor's value."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def sold(stock: Ints, more: Ints, demand: Ints) -> Ints:
 
 
 def truth() -> NDArray[np.float64]:
-    """Distribution of the next stock for every pair (stock, what is added), [pairs, values]."""
+    """True distribution of the next stock for every pair (stock, order), [pairs, values]."""
     probs = np.zeros((len(STOCK), LAST + 1))
     for demand in range(60):
         left = sold(STOCK, ORDER, np.full(len(STOCK), demand))
@@ -46,14 +46,14 @@ def two_products(n: int) -> tuple[Ints, Ints, Ints]:
 
 
 def on_the_way(n: int) -> tuple[Ints, Ints, Ints]:
-    """Stock, and what arrives next and after that; the action is what is ordered."""
+    """Stock and the two orders in transit; the action is the new order."""
     rng = np.random.default_rng(0)
     states = np.column_stack([rng.integers(LAST + 1, size=n), rng.integers(ORDERS, size=(n, 2))])
     actions = rng.integers(ORDERS, size=n)
     return states, actions, np.column_stack([sold(states[:, 0], states[:, 1], rng.poisson(DEMAND, n)), states[:, 2], actions])
 
 
-def test_each_product_has_its_order() -> None:
+def test_each_stock_is_increased_by_its_own_component() -> None:
     model = DecisionGraphModel((LAST + 1, LAST + 1), ORDERS**2, parts=(ORDERS, ORDERS))
     model.fit(dataset((LAST + 1, LAST + 1), ORDERS**2, *two_products(1500)))
     other = np.full(len(STOCK), 4)
@@ -66,7 +66,7 @@ def test_each_product_has_its_order() -> None:
     np.testing.assert_array_equal(loaded, first)
 
 
-def test_what_was_ordered_before_arrives() -> None:
+def test_operand_can_be_another_factor() -> None:
     model = DecisionGraphModel((LAST + 1, ORDERS, ORDERS), ORDERS)
     report = model.fit(dataset((LAST + 1, ORDERS, ORDERS), ORDERS, *on_the_way(1500)))
     states, actions = np.column_stack([STOCK, ORDER, np.full(len(STOCK), 3)]), np.full(len(STOCK), 2)
@@ -82,7 +82,7 @@ def test_what_was_ordered_before_arrives() -> None:
     assert 0.5 * np.abs(listed - probs[:, : LAST + 1]).sum(axis=1).max() < 0.05
 
 
-def test_a_sum_is_not_passed_over_where_much_is_known() -> None:
+def test_sum_is_found_although_the_next_value_is_partly_predictable() -> None:
     rng, n = np.random.default_rng(3), 5000
     states, actions = rng.integers([10, 5], size=(n, 2)), rng.integers(2, size=n)
     left = np.clip(states[:, 0] + states[:, 1] - rng.integers(5, size=n), 0, 9)
@@ -90,13 +90,13 @@ def test_a_sum_is_not_passed_over_where_much_is_known() -> None:
     model.fit(dataset((10, 5), 2, states, actions, np.column_stack([left, rng.integers(5, size=n)])))
     every = np.array(list(np.ndindex(10, 5)))
     expected = np.zeros((50, 10))
-    for uniform in range(5):
-        expected[np.arange(50), np.clip(every.sum(axis=1) - uniform, 0, 9)] += 0.2
+    for demand in range(5):
+        expected[np.arange(50), np.clip(every.sum(axis=1) - demand, 0, 9)] += 0.2
     found = model.marginals(every, np.zeros(50, dtype=np.int64))[:, :10]
-    assert 0.5 * np.abs(found - expected).sum(axis=1).max() < 0.08  # by moves 0.2
+    assert 0.5 * np.abs(found - expected).sum(axis=1).max() < 0.08  # relative effects have 0.2
 
 
-def test_sums_that_would_take_too_much_are_left_alone() -> None:
+def test_sums_that_need_too_many_nodes_are_not_used() -> None:
     rng, n = np.random.default_rng(0), 400
     states = rng.integers(100, size=(n, 2))
     following = states.copy()
@@ -107,7 +107,7 @@ def test_sums_that_would_take_too_much_are_left_alone() -> None:
     assert likely_operands((0,), candidates((10, 10), (1,)), small) == [(Operand(10, 1), 1)]
 
 
-def test_the_likeliest_partner_is_the_one_that_is_added() -> None:
+def test_most_significant_operand_is_the_true_one() -> None:
     parts = (ORDERS, 2, ORDERS)
     every = candidates((LAST + 1, 2, 4), parts)
     assert every == [Operand(LAST + 1, 0), Operand(4, 2), Operand(ORDERS, -1, 12, 0), Operand(ORDERS, -1, 1, 7)]
@@ -122,8 +122,8 @@ def test_the_likeliest_partner_is_the_one_that_is_added() -> None:
     assert likely_operands((0, 2), every, rows(states, actions, following).select(slice(10))) == [None, None]
 
 
-@pytest.mark.parametrize("partner", candidates((LAST + 1, 2, 4), (ORDERS, 2, ORDERS)))
-def test_columns_tell_a_partners_value(operand: Operand) -> None:
+@pytest.mark.parametrize("operand", candidates((LAST + 1, 2, 4), (ORDERS, 2, ORDERS)))
+def test_features_of_an_operand_indicate_its_value(operand: Operand) -> None:
     rng, layout = np.random.default_rng(0), make_layout((LAST + 1, 2, 4), (), action_encoding((ORDERS, 2, ORDERS)))
     states, actions = rng.integers([LAST + 1, 2, 4], size=(200, 3)), rng.integers(72, size=200)
     shown = feature_table(layout, states, actions)[:, operand.features(layout)]
@@ -131,20 +131,20 @@ def test_columns_tell_a_partners_value(operand: Operand) -> None:
     np.testing.assert_array_equal(shown.argmax(axis=1), operand.of(rows(states, actions, states)))
 
 
-def test_chains_lead_on_by_the_partners_value() -> None:
-    links = [(-1, 0, 0)] * 4  # three leaves and one for what has no entry
+def test_chains_select_the_node_of_the_operands_value() -> None:
+    links = [(-1, 0, 0)] * 4  # three leaves and one for values without an entry
     entries = np.array([(0, 5, 7, 1), (2, 5, 7, 2), (1, 5, 8, 3)])
 
     def add(feature: int, off: int, on: int) -> int:
         links.append((feature, off, on))
         return len(links) - 1
 
-    def lead(node: int, value: int) -> int:
+    def follow(node: int, value: int) -> int:
         while links[node][0] >= 0:
             feature, off, on = links[node]
             node = on if feature == 10 + value else off
         return node
 
     nodes = {(now, value): node for now, value, node in chained(entries, np.array([10, 11, 12]), add, 0).tolist()}
-    assert [lead(nodes[5, 7], value) for value in range(3)] == [1, 0, 2]
-    assert [lead(nodes[5, 8], value) for value in range(3)] == [0, 3, 0]
+    assert [follow(nodes[5, 7], value) for value in range(3)] == [1, 0, 2]
+    assert [follow(nodes[5, 8], value) for value in range(3)] == [0, 3, 0]

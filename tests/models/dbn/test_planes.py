@@ -1,4 +1,4 @@
-"""Decision graphs for planes: windows by brute force, the laws of probability, boards of other sizes, files."""
+"""Decision graphs for planes: features by brute force, properties of probabilities, boards of other sizes, files."""
 
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ def planes(*shape: int) -> FactoredSpace:
     return FactoredSpace(spaces.MultiBinary(shape))
 
 
-def test_columns_are_what_lies_around_each_position() -> None:
+def test_relative_features_agree_with_brute_force() -> None:
     rng = np.random.default_rng(0)
     board, actions = rng.integers(2, size=(4, 2, 3, 5)), rng.integers(3, size=4)
     features = relative_features((2, 2), (3,), Reach(1, wrap=True))
@@ -76,9 +76,9 @@ def test_columns_are_what_lies_around_each_position() -> None:
 
 
 def gliders(n: int, seed: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """A glider that moves right, or stays under action 1 and at the border, and lights that go out one by one.
+    """A glider that moves right, or stays under action 1 and at the border, and lights that go out at random.
 
-    The episode ends when the glider stands on a light.
+    The episode ends after a step from a light.
     """
     rng = np.random.default_rng(seed)
     y, x, actions = rng.integers(height, size=n), rng.integers(width, size=n), rng.integers(2, size=n)
@@ -100,7 +100,7 @@ def model() -> LocalGraphModel:
     return fitted
 
 
-def test_a_world_of_planes_is_learned_and_its_end(model: LocalGraphModel) -> None:
+def test_dynamics_of_planes_and_termination_are_learned(model: LocalGraphModel) -> None:
     states, actions, following, ends = gliders(2000, 1, 3, 3)
     drawn, over = model.sample(states, actions, derive(1, np.arange(2000)))
     np.testing.assert_array_equal(drawn[:, :9], following[:, :9])
@@ -111,8 +111,8 @@ def test_a_world_of_planes_is_learned_and_its_end(model: LocalGraphModel) -> Non
     assert not drawn[:, 9:][~on].any()
 
 
-def test_probabilities_sum_to_one_and_are_those_of_draws_marginals_and_successors() -> None:
-    # A plane of three by three where one bit wanders at random: nine outcomes that exclude each other.
+def test_probabilities_sum_to_one_and_agree_with_samples_marginals_and_successors() -> None:
+    # A plane of three by three cells with a random walk of one bit: nine mutually exclusive outcomes.
     rng, n = np.random.default_rng(3), 3000
     place = rng.integers(9, size=n)
     step = np.array([-3, 1, 3, -1])[rng.integers(4, size=n)]
@@ -140,7 +140,7 @@ def test_probabilities_sum_to_one_and_are_those_of_draws_marginals_and_successor
         )
 
 
-def test_what_is_never_on_together_is_drawn_together() -> None:
+def test_mutually_exclusive_cells_are_drawn_jointly() -> None:
     game = FlierCatcher(height=4, width=5)
     space = FactoredSpace(game.observation_space)
     model = LocalGraphModel(space, 3)
@@ -153,7 +153,7 @@ def test_what_is_never_on_together_is_drawn_together() -> None:
     assert abs(spawned.mean() - 0.4) < 5 * np.sqrt(0.24 / 1000)
 
 
-def test_what_was_learned_on_one_board_holds_on_another() -> None:
+def test_model_of_one_board_applies_to_another() -> None:
     model = LocalGraphModel(FactoredSpace(Maneuverer(size=5).observation_space), 4)
     report = model.fit(played(Maneuverer(size=5), 2000, 100))
     assert report.exact_match is not None
@@ -168,7 +168,7 @@ def test_what_was_learned_on_one_board_holds_on_another() -> None:
 
 
 @pytest.mark.parametrize("last", [False, True])
-def test_cells_of_many_values_and_channels_in_either_place(last: bool) -> None:
+def test_cells_of_many_values_with_channels_first_or_last(last: bool) -> None:
     # Cells of three values count up where the cell above is 2; the second channel never changes.
     rng, n = np.random.default_rng(6), 1500
     board = np.stack([rng.integers(3, size=(n, 4, 4)), rng.integers(2, size=(n, 4, 4))], axis=1)
@@ -189,7 +189,7 @@ def test_cells_of_many_values_and_channels_in_either_place(last: bool) -> None:
     np.testing.assert_allclose(model.marginals(flat(board)[:3], none[:3]).sum(axis=1), 32.0)
 
 
-def test_weights_come_back_and_damaged_ones_are_refused(model: LocalGraphModel) -> None:
+def test_weights_are_restored_and_damaged_ones_refused(model: LocalGraphModel) -> None:
     states, actions, _, _ = gliders(200, 4, 3, 3)
     keys = derive(1, np.arange(200))
     other = LocalGraphModel(planes(2, 3, 3), 2)
@@ -212,7 +212,7 @@ def test_weights_come_back_and_damaged_ones_are_refused(model: LocalGraphModel) 
         LocalGraphModel(FactoredSpace(spaces.MultiBinary(9)), 2)
 
 
-def test_an_agent_plans_on_local_graphs_and_is_saved_with_them(tmp_path: Path) -> None:
+def test_agent_plans_with_local_graphs_and_saves_them(tmp_path: Path) -> None:
     env = gym.make("mbagent/FlierCatcher-v0", height=3, width=4)
     agent = ModelLearningAgent("MctsPolicy", env, model="graphs", num_simulations=16, seed=0)
     agent.learn(1000)
@@ -223,18 +223,18 @@ def test_an_agent_plans_on_local_graphs_and_is_saved_with_them(tmp_path: Path) -
     np.testing.assert_array_equal(again.predict(obs)[0], agent.predict(obs)[0])
 
 
-def test_an_empty_history_teaches_nothing() -> None:
+def test_fit_to_no_transitions_predicts_no_change() -> None:
     fresh = LocalGraphModel(planes(1, 3, 3), 2)
     fresh.fit(TransitionDataset((2,) * 9, 2))
     state = np.eye(9, dtype=np.int64)[:1]
     np.testing.assert_array_equal(fresh.sample(state, np.array([1]), derive(1, np.arange(1)))[0], state)
 
 
-def test_lines_that_a_smaller_board_does_not_have_are_left_out() -> None:
+def test_mutex_groups_of_rows_missing_on_a_smaller_board_are_ignored() -> None:
     rng, n, space = np.random.default_rng(0), 4000, planes(1, 8, 4)
     states = np.zeros((n, 1, 8, 4), dtype=np.int64)
     following = (rng.random((n, 1, 8, 4)) < 0.5).astype(np.int64)
-    following[:, 0, 3] = np.eye(5, dtype=np.int64)[rng.integers(5, size=n), :4]  # one at most, in row 3 only
+    following[:, 0, 3] = np.eye(5, dtype=np.int64)[rng.integers(5, size=n), :4]  # at most one is on, in row 3 only
     model = LocalGraphModel(space, 2)
     model.fit(dataset(space.cardinalities, 2, states.reshape(n, -1), rng.integers(2, size=n), following.reshape(n, -1)))
     assert any(mutex.line in (3, -5) for mutex in model.local.mutexes)

@@ -1,4 +1,4 @@
-"""Outcomes far below one percent take part in plans, with the probability that their counts say; noise of the fit does not."""
+"""Outcomes far below one percent take part in plans, with the probability estimated from counts; noise of the fit does not."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,8 @@ RISK = 0.004
 Rows = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
-def machine(n: int, n_coins: int, seed: int, ends: bool = True) -> Rows:
-    """Gear 0 ... 2, whether it is broken, and coins that fall anew at every step; action 1 shifts up and may break it."""
+def gearbox(n: int, n_coins: int, seed: int, ends: bool = True) -> Rows:
+    """Gear 0 ... 2, whether it is broken, and coins that are drawn at every step; action 1 shifts up and may break it."""
     rng = np.random.default_rng(seed)
     gear, action = rng.integers(3, size=n), rng.integers(2, size=n)
     broken = (action == 1) & (rng.random(n) < RISK)
@@ -25,7 +25,7 @@ def machine(n: int, n_coins: int, seed: int, ends: bool = True) -> Rows:
 def learned(n_coins: int, **kwargs: bool) -> DecisionGraphModel:
     cardinalities = (3, 2) + (2,) * n_coins
     model = DecisionGraphModel(cardinalities, 2)
-    model.fit(dataset(cardinalities, 2, *machine(15_000, n_coins, 0, **kwargs)))
+    model.fit(dataset(cardinalities, 2, *gearbox(15_000, n_coins, 0, **kwargs)))
     return model
 
 
@@ -47,9 +47,9 @@ def listed(model: DecisionGraphModel, state: list[int], n: int) -> list[tuple[np
 
 @pytest.mark.parametrize("n_coins", [0, 6])
 @pytest.mark.parametrize("ends", [True, False])
-def test_what_was_observed_is_planned_with_however_few_draws_there_are(n_coins: int, ends: bool) -> None:
+def test_observed_outcomes_are_listed_however_few_draws_there_are(n_coins: int, ends: bool) -> None:
     model = learned(n_coins, ends=ends)
-    _, action, after, _ = machine(15_000, n_coins, 0)
+    _, action, after, _ = gearbox(15_000, n_coins, 0)
     share = after[action == 1, 1].mean()
     for n in (4, 16):
         safe, risky = listed(model, [1, 0] + [0] * n_coins, n)
@@ -61,14 +61,14 @@ def test_what_was_observed_is_planned_with_however_few_draws_there_are(n_coins: 
         assert risky[2].sum() == pytest.approx(1.0)
 
 
-def test_what_was_never_observed_is_not_planned_with() -> None:
+def test_unobserved_outcomes_are_not_listed() -> None:
     model = learned(0)
     safe, risky = listed(model, [2, 0], 16)
     assert safe[0].tolist() == [[1, 0]]
     assert risky[0].tolist() == [[2, 0], [2, 1]]
 
 
-def test_a_value_of_many_that_comes_rarely_is_planned_with_as_is_staying() -> None:
+def test_rare_value_of_many_and_rare_persistence_are_listed() -> None:
     rng = np.random.default_rng(1)
     before = rng.integers(5, size=12_000)
     u = rng.random(12_000)
@@ -82,7 +82,7 @@ def test_a_value_of_many_that_comes_rarely_is_planned_with_as_is_staying() -> No
     assert set(chances) == {0, 2, 3}
 
 
-def test_one_of_a_thousand_events_in_which_everything_changes_is_planned_with() -> None:
+def test_rare_resets_are_listed() -> None:
     rng = np.random.default_rng(5)
     n, bits = 20_000, 12
     before, action = rng.integers(2, size=(n, bits)), rng.integers(2, size=n)
@@ -99,7 +99,7 @@ def test_one_of_a_thousand_events_in_which_everything_changes_is_planned_with() 
 
 
 @pytest.mark.parametrize("risk", [RISK, 0.0015])
-def test_two_rare_things_that_come_together_are_one_outcome(risk: float) -> None:
+def test_two_rare_changes_that_occur_together_are_one_outcome(risk: float) -> None:
     rng = np.random.default_rng(0)
     n = 15_000
     action = rng.integers(2, size=n)

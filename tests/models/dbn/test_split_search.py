@@ -1,4 +1,4 @@
-"""The search for what a head hangs on: evidence against a closed form, planted causes found, and no others."""
+"""Search for the splits of a target: evidence against a closed form; true dependencies are found, and no others."""
 
 import numpy as np
 import pytest
@@ -13,15 +13,15 @@ RNG = np.random.default_rng(0)
 
 
 def target(positives: np.ndarray, context: np.ndarray | None = None) -> Target:
-    """A head over all rows; contexts are actions with one value."""
+    """A target over all rows; contexts are actions with one value."""
     context = np.zeros(len(positives), dtype=np.int64) if context is None else context
     n = int(context.max()) + 1
     once = np.ones(len(positives), dtype=np.int64)
     return Target(np.arange(len(positives)), once, positives.astype(np.int64), context, np.arange(n), np.zeros(n, dtype=np.int64))
 
 
-def rate_by_columns(search: Search, table: np.ndarray) -> np.ndarray:
-    """Share of arrivals in the context of each row."""
+def rates_of_rows(search: Search, table: np.ndarray) -> np.ndarray:
+    """Share of positives in the context of each row."""
     n, e = search.counts()
     rates: np.ndarray = (e / np.maximum(n, 1))[search.target.context]
     assert len(rates) == len(table)
@@ -35,13 +35,13 @@ def test_evidence_is_the_marginal_likelihood_under_a_beta_prior() -> None:
         assert evidence(positives, n, *tables) == pytest.approx(exact)
 
 
-def test_the_best_split_has_the_evidence_that_counting_by_hand_gives() -> None:
+def test_gain_of_the_best_split_agrees_with_direct_computation() -> None:
     table = RNG.random((300, 6)) < 0.4
     context = RNG.integers(3, size=300)
     positives = (table[:, 4] & (context != 1)) | (RNG.random(300) < 0.1)
     tables = evidence_tables(301)
-    asked = target(positives, context)
-    chosen = best_split(asked, count(asked, feature_blocks(table)), np.full(6, -2.0), np.array([-50.0, -50.0, -3.0]), tables)
+    one = target(positives, context)
+    chosen = best_split(one, count(one, feature_blocks(table)), np.full(6, -2.0), np.array([-50.0, -50.0, -3.0]), tables)
 
     def total(rows: np.ndarray) -> float:
         return float(evidence(int(positives[rows].sum()), int(rows.sum()), *tables))
@@ -59,7 +59,7 @@ def test_the_best_split_has_the_evidence_that_counting_by_hand_gives() -> None:
     assert (chosen.kind, chosen.which, chosen.feature) == best
 
 
-def test_one_cause_is_found_from_little_data_and_nothing_else() -> None:
+def test_one_relevant_feature_is_found_from_little_data_and_no_others() -> None:
     table = RNG.random((120, 80)) < 0.3
     found = find_splits([target(table[:, 17])], table, np.zeros(80, dtype=np.int64), 1)[0]
     assert [split.feature for split in found.splits if split.feature >= 0] == [17]
@@ -68,16 +68,16 @@ def test_one_cause_is_found_from_little_data_and_nothing_else() -> None:
 
 
 @pytest.mark.parametrize("rule", ["xor", "and", "neither", "second only"])
-def test_causes_that_matter_only_together_are_found(rule: str) -> None:
+def test_features_that_matter_only_jointly_are_found(rule: str) -> None:
     table = RNG.random((600, 40)) < 0.5
     first, second = table[:, 5], table[:, 31]
     positives = {"xor": first ^ second, "and": first & second, "neither": ~first & ~second, "second only": ~first & second}[rule]
     found = find_splits([target(positives)], table, np.zeros(40, dtype=np.int64), 1)[0]
     assert {split.feature for split in found.splits if split.feature >= 0} == {5, 31}
-    np.testing.assert_array_equal(rate_by_columns(found, table), positives.astype(float))
+    np.testing.assert_array_equal(rates_of_rows(found, table), positives.astype(float))
 
 
-def test_contexts_with_one_rate_share_a_leaf_and_others_do_not() -> None:
+def test_contexts_with_equal_rates_share_a_leaf_and_others_do_not() -> None:
     context = np.repeat(np.arange(4), 200)
     positives = RNG.random(800) < np.array([0.5, 0.5, 0.5, 0.5])[context]
     assert (
@@ -99,7 +99,7 @@ def test_contexts_with_one_rate_share_a_leaf_and_others_do_not() -> None:
     )
 
 
-def test_groups_of_bits_of_which_one_is_on_are_found_and_no_others() -> None:
+def test_groups_of_bits_of_which_exactly_one_is_on_are_found_and_no_others() -> None:
     n, position, phase = 400, RNG.integers(6, size=401), RNG.integers(4, size=401)
     table = np.concatenate([np.eye(6)[position], np.eye(4)[phase], RNG.random((401, 5)) < 0.5], axis=1).astype(np.int64)
     table = np.concatenate([table, np.zeros((401, 1), dtype=np.int64)], axis=1)  # a bit that is never on
@@ -113,7 +113,7 @@ def test_groups_of_bits_of_which_one_is_on_are_found_and_no_others() -> None:
     assert find_groups((2, 2), mixed[:0, :2], mixed[:0, :2]) == ()
 
 
-def test_bits_never_on_together_are_told_from_bits_that_seldom_are() -> None:
+def test_bits_never_on_together_are_distinguished_from_bits_rarely_on_together() -> None:
     p, n = 0.05, 8000
     chosen = RNG.integers(20, size=n)  # 0 ... 3: one of four bits that exclude each other; else none of them
     free = RNG.random((n, 4)) < p
@@ -123,10 +123,10 @@ def test_bits_never_on_together_are_told_from_bits_that_seldom_are() -> None:
     expected = np.full((8, 8), n * p * p)
     cliques = find_cliques(on.T @ on, expected)
     assert [clique.tolist() for clique in cliques] == [sorted(np.flatnonzero(np.isin(order, range(4))).tolist())]
-    assert find_cliques(on.T @ on, expected / 10) == []  # with less to expect, never is no surprise
+    assert find_cliques(on.T @ on, expected / 10) == []  # not significant if few joint occurrences are expected
 
 
-def test_a_bit_that_goes_out_and_never_comes_on_again_ends_the_search() -> None:
+def test_search_ends_with_a_bit_that_is_only_switched_off() -> None:
     before = np.zeros((50, 4), dtype=np.int64)
     before[:, 3] = 1
     before[0, :] = [0, 1, 0, 0]  # bit 1 is on once, before the first step only

@@ -1,4 +1,4 @@
-"""Variables that depend on each other, and variables that move: learned jointly, with exact probabilities."""
+"""Synchronic arcs and relative effects, with exact joint probabilities."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ CARDINALITIES = (2, 2, 3)
 
 
 def tied_world(n: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Two coins that fall alike under action 0 and unlike under action 1; a die; the end comes where all show their highest."""
+    """Two coins, equal under action 0 and different under action 1; a die; the episode ends if all have their highest values."""
     rng = np.random.default_rng(seed)
     states, actions = rng.integers(0, CARDINALITIES, size=(n, 3)), rng.integers(2, size=n)
     coin, die = rng.integers(2, size=n), rng.integers(3, size=n)
@@ -28,7 +28,7 @@ def tied() -> DecisionGraphModel:
     return model
 
 
-def test_variables_that_depend_on_each_other_are_drawn_jointly(tied: DecisionGraphModel) -> None:
+def test_dependent_next_values_have_exact_joint_probabilities(tied: DecisionGraphModel) -> None:
     possible, ends = outcomes(CARDINALITIES)
     assert tied.fitted.synchronic.changing.tolist() == [1, 3]  # the second coin, given the first; the end, given all
     for action in (0, 1):
@@ -40,7 +40,7 @@ def test_variables_that_depend_on_each_other_are_drawn_jointly(tied: DecisionGra
         assert 0.5 * np.abs(probs - true).sum() < 0.03
 
 
-def test_draws_and_successors_follow_the_joint_probabilities(tied: DecisionGraphModel) -> None:
+def test_samples_and_successors_follow_the_joint_probabilities(tied: DecisionGraphModel) -> None:
     possible, ends = outcomes(CARDINALITIES)
     n, state = 40_000, np.array([[1, 0, 2]])
     probs = np.exp(tied.log_prob(np.tile(state, (24, 1)), np.ones(24, dtype=np.int64), possible, ends))
@@ -55,7 +55,7 @@ def test_draws_and_successors_follow_the_joint_probabilities(tied: DecisionGraph
     assert ((likeliest[:, 0] ^ likeliest[:, 1]) == [0, 1]).all()
 
 
-def test_weights_of_late_graphs_are_saved(tied: DecisionGraphModel) -> None:
+def test_weights_of_synchronic_graphs_are_saved(tied: DecisionGraphModel) -> None:
     other = DecisionGraphModel(CARDINALITIES, 2)
     other.load_state_dict(tied.state_dict())
     states, actions, following, ends = tied_world(50, 3)
@@ -64,7 +64,7 @@ def test_weights_of_late_graphs_are_saved(tied: DecisionGraphModel) -> None:
     )
 
 
-def test_what_moves_alike_everywhere_is_known_where_it_never_was() -> None:
+def test_relative_effects_generalise_to_unobserved_values() -> None:
     rng, cards = np.random.default_rng(0), (40,)
     states, actions = rng.integers(30, size=(600, 1)), rng.integers(3, size=600)  # never at 30 ... 39
     following = (states + np.array([1, -1, 5])[actions][:, None]) % 40
@@ -76,7 +76,7 @@ def test_what_moves_alike_everywhere_is_known_where_it_never_was() -> None:
 
 
 def wanderers(n: int, seed: int) -> tuple[FactoredSpace, np.ndarray, np.ndarray, np.ndarray]:
-    """Two things on a board, each of which stays or goes to a free neighbouring cell, whatever the action."""
+    """Two objects on a board, each of which stays or moves to a free neighbouring cell, independently of the action."""
     rng, size = np.random.default_rng(seed), 5
     states, following = np.zeros((2, n, size, size), dtype=np.int64)
     for b in range(n):
@@ -91,18 +91,18 @@ def wanderers(n: int, seed: int) -> tuple[FactoredSpace, np.ndarray, np.ndarray,
     return space, states.reshape(n, -1), rng.integers(2, size=n), following.reshape(n, -1)
 
 
-def test_several_things_on_one_plane_are_each_drawn_once() -> None:
+def test_several_objects_on_one_plane_are_each_drawn_once() -> None:
     space, states, actions, following = wanderers(4000, 0)
     model = LocalGraphModel(space, 2)
     model.fit(dataset(space.cardinalities, 2, states, actions, following))
     assert model.local.synchronic.changing.tolist() == [0]
     _, tests, chosen, _ = wanderers(1000, 1)
     drawn, _ = model.sample(tests, chosen, derive(5, np.arange(1000)))
-    assert (drawn.sum(axis=1) == 2).mean() > 0.75  # 0.3 where every cell is drawn for itself
+    assert (drawn.sum(axis=1) == 2).mean() > 0.75  # 0.3 if every cell is drawn independently
 
 
 @pytest.mark.parametrize("wrap", [False, True])
-def test_how_far_neighbourhoods_reach_is_found(wrap: bool) -> None:
+def test_reach_of_neighbourhoods_is_found(wrap: bool) -> None:
     rng, n, width = np.random.default_rng(0), 2500, 8
     states = (rng.random((n, 1, 3, width)) < 0.3).astype(np.int64)
     following = np.roll(states, 2, axis=3)
@@ -116,11 +116,11 @@ def test_how_far_neighbourhoods_reach_is_found(wrap: bool) -> None:
     assert report.exact_match == 1.0
 
 
-def test_the_end_of_an_episode_is_known_by_where_the_step_led() -> None:
+def test_end_of_an_episode_is_predicted_from_the_next_state() -> None:
     rng, n, size = np.random.default_rng(0), 3000, 5
     place, action = rng.integers(size * size, size=n), rng.integers(2, size=n)
     y, x = place // size, place % size
-    row = np.where(rng.random(n) < 0.5, np.minimum(y + 1, size - 1), y)  # falls or not, by chance; ends at the bottom
+    row = np.where(rng.random(n) < 0.5, np.minimum(y + 1, size - 1), y)  # falls at random; the episode ends at the bottom
     states, following = (np.eye(size * size, dtype=np.int64)[cells] for cells in (place, row * size + x))
     space = FactoredSpace(spaces.MultiBinary((1, size, size)))
     model = LocalGraphModel(space, 2)
@@ -129,7 +129,7 @@ def test_the_end_of_an_episode_is_known_by_where_the_step_led() -> None:
     np.testing.assert_array_equal(over, drawn.reshape(n, size, size)[:, -1].any(axis=1))
 
 
-def test_states_that_break_a_group_have_probabilities_too() -> None:
+def test_states_that_violate_a_group_have_valid_probabilities() -> None:
     rng, n = np.random.default_rng(0), 1500
     place, actions = rng.integers(4, size=n), rng.integers(2, size=n)
     states, following = (np.eye(4, dtype=np.int64)[p] for p in (place, (place + np.where(rng.random(n) < 0.5, 1, actions)) % 4))

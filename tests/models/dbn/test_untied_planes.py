@@ -1,4 +1,4 @@
-"""Planes whose rules hang on the place, and planes whose rules do not."""
+"""Planes whose dynamics depend on the position, and planes whose dynamics do not."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ SIZE = 9
 
 
 def walk(n: int, flip: np.ndarray, seed: int = 0) -> tuple[FactoredSpace, TransitionDataset]:
-    """A dot on a torus goes down, and to the right under action 1, to the left under 0; in cells of ``flip`` the other way."""
+    """A dot on a torus moves down and, under action 1, right, under action 0, left; in cells of ``flip``, these are exchanged."""
     rng, space = np.random.default_rng(seed), FactoredSpace(spaces.MultiBinary((SIZE, SIZE)))
     places, actions = rng.integers(SIZE, size=(n, 2)), rng.integers(2, size=n)
     right = actions ^ flip[places[:, 0], places[:, 1]]
@@ -29,7 +29,7 @@ def walk(n: int, flip: np.ndarray, seed: int = 0) -> tuple[FactoredSpace, Transi
     return space, data
 
 
-def test_cells_are_learned_for_themselves_where_rules_hang_on_the_place() -> None:
+def test_untied_graphs_are_used_if_dynamics_depend_on_the_position() -> None:
     flip = np.random.default_rng(3).integers(2, size=(SIZE, SIZE))
     space, data = walk(3000, flip)
     model = PlaneGraphModel(space, 2)
@@ -45,11 +45,11 @@ def test_cells_are_learned_for_themselves_where_rules_hang_on_the_place() -> Non
     other.load_state_dict(model.state_dict())
     again = other.log_prob(rows.states, rows.actions, rows.next_states, rows.terminated)
     np.testing.assert_array_equal(again, model.log_prob(rows.states, rows.actions, rows.next_states, rows.terminated))
-    with pytest.raises(ValueError, match="hangs on the place"):
+    with pytest.raises(ValueError, match="depend on the position"):
         other.for_space(spaces.MultiBinary((11, 11)))
 
 
-def test_rules_that_are_the_same_everywhere_stay_so() -> None:
+def test_tied_graphs_are_used_if_dynamics_are_the_same_everywhere() -> None:
     space, data = walk(1500, np.zeros((SIZE, SIZE), dtype=np.int64))
     model = PlaneGraphModel(space, 2)
     report = model.fit(data)
@@ -61,8 +61,8 @@ def test_rules_that_are_the_same_everywhere_stay_so() -> None:
     assert model.for_space(spaces.MultiBinary((11, 11))).cardinalities == (2,) * 121
 
 
-def test_places_are_known_as_they_are_now_where_rules_have_changed() -> None:
-    """Left and right changed places in every cell; what was before says the contrary."""
+def test_untied_graphs_follow_a_change_of_rules() -> None:
+    """Left and right are exchanged in every cell, so that earlier transitions contradict later ones."""
     flip = np.random.default_rng(3).integers(2, size=(SIZE, SIZE))
     space, data = walk(3000, flip)
     new = walk(3000, 1 - flip, 1)[1].rows()

@@ -11,7 +11,7 @@ SMALL = BoltzmannConfig(hidden=6, min_steps=400, max_steps=400)
 
 
 def coupled(n: int = 400, seed: int = 0) -> TransitionDataset:
-    """Two bits and a factor of three values: the bits agree if the state's first is 1, else differ; the third follows the sum."""
+    """Two bits, equal if the state's first bit is 1, else different, and a factor of three values, which is their sum."""
     rng = np.random.default_rng(seed)
     data = TransitionDataset((2, 2, 3), 2)
     states = np.stack([rng.integers(2, size=n), rng.integers(2, size=n), rng.integers(3, size=n)], axis=1)
@@ -54,10 +54,10 @@ def test_draws_follow_the_exact_probabilities(fitted: ConditionalBoltzmannMachin
     assert 0.5 * np.abs(frequencies - np.exp(logs)).sum() < 0.03
 
 
-def test_it_learns_what_the_variables_have_to_do_with_each_other(fitted: ConditionalBoltzmannMachine) -> None:
+def test_it_learns_dependencies_between_variables(fitted: ConditionalBoltzmannMachine) -> None:
     rows = coupled(seed=1).rows()
     logs = fitted.log_prob(rows.states, rows.actions, rows.next_states, rows.terminated)
-    assert -logs.mean() == pytest.approx(np.log(2.0), abs=0.05)  # one fair coin is all there is to guess
+    assert -logs.mean() == pytest.approx(np.log(2.0), abs=0.05)  # the entropy of one fair coin
     marginals = fitted.marginals(rows.states, rows.actions)
     assert marginals.shape == (len(rows), 7)
     np.testing.assert_allclose(marginals[:, :2].mean(axis=0), 0.5, atol=0.05)
@@ -78,7 +78,7 @@ def test_contrastive_divergence_learns_too() -> None:
     assert -model.log_prob(rows.states, rows.actions, rows.next_states, rows.terminated).mean() < 1.2
 
 
-def test_weights_travel_and_wrong_ones_are_refused() -> None:
+def test_weights_can_be_copied_and_wrong_ones_are_refused() -> None:
     model, other = (ConditionalBoltzmannMachine((2, 2, 3), 2, SMALL, seed=seed) for seed in (0, 1))
     other.load_state_dict(model.state_dict())
     for name, value in model.state_dict().items():
