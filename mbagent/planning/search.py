@@ -141,8 +141,9 @@ def back_up_mean(
     """Running means of the simulated returns: UCT (Kocsis and Szepesvari 2006).
 
     The initial value counts as ``prior_visits`` returns. Arguments that ``back_up_max`` does not have: ``prior_visits``;
-    ``end_values`` [R, W], value of the node at which a simulation ended; ``counted`` [N, A], number of averaged returns; ``extremes`` [R, 2], lowest and highest return, from which ``spans`` [R]
-    are computed. ``counted``, ``q``, ``spans`` and ``extremes`` are updated in place.
+    ``end_values`` [R, W], value of the node at which a simulation ended; ``counted`` [N, A], number of averaged returns;
+    ``extremes`` [R, 2], lowest and highest return, from which ``spans`` [R] are computed. ``counted``, ``q``, ``spans`` and
+    ``extremes`` are updated in place.
     """
     n_roots, n_simulations, _ = edges.shape
     for r in range(n_roots):

@@ -178,7 +178,7 @@ class PlaneTable:
         return np.stack(found, axis=1)
 
     def split(self, asked: Sequence[Question], table: Bools, numbers: Ints) -> list[Search]:
-        """Searches for the splits of the questions ``asked``, completed on ``table``, whose columns are the features ``numbers``."""
+        """Completed searches for the splits of questions; the columns of ``table`` are the relative features ``numbers``."""
         kinds = feature_kinds(self.features)[numbers]
         found = find_splits([q.target for q in asked], table, kinds, self.encoding.n_action_classes, self.in_pairs)
         return [search.renamed(numbers) for search in found]
