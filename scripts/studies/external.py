@@ -163,7 +163,7 @@ def _ours(cell: Cell) -> Player:
 def _with_true_model(cell: Cell) -> Player:
     known = true_model(cell.world)
     if known is None:
-        raise ValueError(f"The true rules of {cell.world.name} are not at hand.")
+        raise ValueError(f"The true rules of {cell.world.name} are not available.")
     model, reward = known
     agent = ModelLearningAgent("MctsPolicy", cell.world.make(), model=model, reward=reward, seed=cell.seed)
     return Player(as_policy(agent), 0, 0.0, True)

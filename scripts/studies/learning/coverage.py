@@ -69,7 +69,7 @@ def outcomes(world: World, exact: FiniteHorizonMDP, numbers: NDArray[np.int64], 
         return Successors(offsets, states[following], np.zeros(len(rows), dtype=np.bool_), chances)
     known = true_model(world)
     if known is None:
-        raise ValueError(f"The true rules of {world.name} are not at hand.")
+        raise ValueError(f"The true rules of {world.name} are not available.")
     return known[0].successors(states[numbers], actions, MAX_OUTCOMES, 0)
 
 
@@ -105,7 +105,7 @@ def _exactly(world: World, agent: ModelLearningAgent) -> Callable[[], Row]:
     """What measures an agent in a world that is known as tables."""
     exact = exact_world(world)
     if exact is None:
-        raise ValueError(f"The true rules of {world.name} are not at hand.")
+        raise ValueError(f"The true rules of {world.name} are not available.")
     n_actions, states = agent.policy.actions.n, agent.policy.factored.encode(exact.observations)
     pairs = _pairs(reachable(exact), n_actions)
     some = pairs[np.random.default_rng(0).permutation(len(pairs))[:MAX_PAIRS]]

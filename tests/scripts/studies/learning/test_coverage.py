@@ -46,7 +46,7 @@ def test_the_script_writes_table_and_picture_and_refuses_what_it_does_not_know(
     assert (tmp_path / "coverage.png").read_bytes()[:4] == b"\x89PNG"
     for wrong, told in (
         (["--explorations", "bold"], "bold"),
-        (["--worlds", "CartPole, binned"], "not at hand"),
+        (["--worlds", "CartPole, binned"], "not available"),
         (["--marks", "20", "10"], "ascending"),
     ):
         assert main(wrong) == 1
