@@ -1,4 +1,4 @@
-"""What an experiment leaves on disk, so that the page can be written again without measuring again."""
+"""Results of the experiment on disk, from which the page can be rewritten without new measurements."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MOST_POINTS = 4000
 
 
 def first_points(results: Sequence[Result[Cell]]) -> Points:
-    """The points of each trial's first data set, thinned out where they are too many to draw."""
+    """The points of each trial's first data set, thinned out if there are too many to plot."""
     points: Points = {}
     for result in sorted(results, key=lambda result: result.cell.seed, reverse=True):
         for sampler, pairs in result.arrays.items():
@@ -42,7 +42,7 @@ def save_points(path: Path, points: Points) -> None:
 
 
 def load_points(path: Path) -> Points:
-    """Reads what ``save_points`` wrote; nothing where there is no such file.
+    """Reads a file of ``save_points``; empty if there is no such file.
 
     Raises:
         ValueError: the file is damaged.
@@ -58,7 +58,7 @@ def load_points(path: Path) -> Points:
 
 
 def load_scores(path: Path) -> list[Score]:
-    """Reads a table of scores; nothing where there is no such file.
+    """Reads a table of scores; empty if there is no such file.
 
     Raises:
         ValueError: the file is damaged; the message names the line.
@@ -87,7 +87,7 @@ def save_settings(path: Path, settings: Settings) -> None:
 
 
 def load_settings(path: Path) -> Settings:
-    """Reads what ``save_settings`` wrote.
+    """Reads a file of ``save_settings``.
 
     Raises:
         ValueError: there is no such file, or it is damaged.
