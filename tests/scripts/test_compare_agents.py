@@ -59,7 +59,7 @@ def test_a_new_run_deletes_nothing_but_what_an_earlier_one_wrote(
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "Learning curves" not in page  # an empty figure would be worse than none
     assert "Stable-Baselines3 use" not in page
-    # Other options do not matter to a page written again: it is that run's.
+    # A rewritten page ignores other options: it uses the settings of that run.
     assert main(["--report-only", "--output", str(tmp_path)]) == 0
     capsys.readouterr()
 

@@ -76,7 +76,7 @@ def test_without_peers_one_line_says_so_and_the_page_shows_the_rest(tmp_path: Pa
     assert [(row.roots, row.simulations) for row in speeds] == [(1, 256), (1, 1024), (16, 1024)]
     pictures = write_page(tmp_path / "report.html", {"regret": [vars(row) for row in regrets], "speed": []}, "a command")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "What searches lose" in page
+    assert "Regret of searches against the number of simulations" in page
     assert "Speed of searches in tabular MDPs" not in page
     assert pictures["regret"].startswith(b"\x89PNG")
 
