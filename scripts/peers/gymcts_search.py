@@ -68,9 +68,9 @@ class TableEnv(GymctsABC):  # type: ignore[misc]
 
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
         """See gym.Env."""
-        luck, chosen = random.random(), 0
+        noise, chosen = random.random(), 0
         cumulated = self.cumulated[self.at][action]
-        while chosen < len(cumulated) - 1 and luck >= cumulated[chosen]:
+        while chosen < len(cumulated) - 1 and noise >= cumulated[chosen]:
             chosen += 1
         self.at = self.successors[self.at][action][chosen]
         self.earned += self.discount * self.rewards[self.at]

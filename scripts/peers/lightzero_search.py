@@ -53,8 +53,8 @@ def search_tree(tree: Any, arrays: dict[str, Array], roots: Array, simulations: 
         results = tree.ResultsWrapper(num=n_roots)
         path, batch, actions, players = tree.batch_traverse(nodes, PB_C_BASE, PB_C_INIT, gamma, stats, results, nobody)
         at = states[path, batch]
-        luck = rng.random(n_roots)
-        chosen = (luck[:, None] >= cumulated[at, actions, :-1]).sum(axis=1)
+        noise = rng.random(n_roots)
+        chosen = (noise[:, None] >= cumulated[at, actions, :-1]).sum(axis=1)
         following = states[simulation] = arrays["successors"][at, actions, chosen]
         # Nodes cannot terminate; terminated states lead to themselves with reward 0 (see ``without_ends``).
         rewards, values = arrays["rewards"][at, following], arrays["leaf_values"][following]

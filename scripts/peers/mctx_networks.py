@@ -41,10 +41,10 @@ def predict(params: Params, states: Any, actions: Any) -> tuple[Any, Any]:
 def sample(params: Params, key: Any, states: Any, actions: Any) -> Any:
     """Next bits [B, O], ``terminated`` last."""
     logits, columns = predict(params, states, actions)
-    luck = jax.random.uniform(key, logits.shape)
+    noise = jax.random.uniform(key, logits.shape)
     p = jax.nn.sigmoid(logits)
     sure = jnp.maximum(p, 1.0 - p) >= params["certain"]
-    drawn = (luck < p).astype(jnp.float32)
+    drawn = (noise < p).astype(jnp.float32)
     known = jnp.einsum("bi,gih->gbh", columns, params["group_inputs"]) + params["group_bias"][:, None, :]
 
     def condition(outcome: Any, group: Any) -> tuple[Any, None]:
@@ -52,7 +52,7 @@ def sample(params: Params, key: Any, states: Any, actions: Any) -> Any:
         hidden = jax.nn.silu(group["known"] + outcome @ group["others"])
         i = group["member"]
         logit = logits[:, i] + hidden @ group["readout"][:, 1] + group["offset"][1]
-        bit = (luck[:, i] < jax.nn.sigmoid(logit)).astype(jnp.float32)
+        bit = (noise[:, i] < jax.nn.sigmoid(logit)).astype(jnp.float32)
         return outcome.at[:, i].set(jnp.where(sure[:, i], outcome[:, i], bit)), None
 
     groups = {

@@ -113,7 +113,7 @@ def _players(cell: Cell) -> Sequence[Callable[[], Player]]:
         env = cell.world.make()
         agent = _learned(cell, env)
         limit = _limit(env)
-        make_env = partial(_imagined, agent, limit)
+        make_env = partial(_learned_env, agent, limit)
     name = cast("BaselineName", "PPO" if cell.agent == IMAGINED else cell.agent)
     began = time.perf_counter()
     algorithm, _ = train_baseline(
@@ -143,7 +143,7 @@ def _learned(cell: Cell, env: gym.Env[Any, Any]) -> ModelLearningAgent:
     return agent.learn(cell.steps, log_interval=None)
 
 
-def _imagined(agent: ModelLearningAgent, limit: int | None) -> gym.Env[Any, Any]:
+def _learned_env(agent: ModelLearningAgent, limit: int | None) -> gym.Env[Any, Any]:
     return for_networks(LearnedEnv(agent, max_episode_steps=limit))
 
 
@@ -193,14 +193,14 @@ def _exact_return(cell: Cell, player: Player) -> float:
 def _observed(cell: Cell, policy: Policy) -> np.ndarray:
     """Observations from play in one copy of the environment."""
     env = cell.world.make()
-    met: list[Any] = []
+    observed: list[Any] = []
     obs, _ = env.reset(seed=cell.seed)
-    while len(met) < TIMED:
-        met.append(obs)
+    while len(observed) < TIMED:
+        observed.append(obs)
         obs, _, terminated, truncated, _ = env.step(int(policy(np.asarray(obs)[None])[0]))
         if terminated or truncated:
             obs, _ = env.reset()
-    return np.stack(met)
+    return np.stack(observed)
 
 
 def show(rows: Sequence[Row], run: Run) -> None:

@@ -29,9 +29,9 @@ class IndependentModel(ExactModel):
 
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
         """See TransitionModel."""
-        luck = uniforms(as_keys(rng, len(states)), states.shape[1])
+        noise = uniforms(as_keys(rng, len(states)), states.shape[1])
         below = np.cumsum(self._chances(states, actions), axis=2)[:, :, :-1]
-        return (below <= luck[:, :, None]).sum(axis=2), np.zeros(len(states), dtype=np.bool_)
+        return (below <= noise[:, :, None]).sum(axis=2), np.zeros(len(states), dtype=np.bool_)
 
     def marginals(self, states: States, actions: Actions) -> Floats:
         """See TransitionModel."""

@@ -39,13 +39,13 @@ class Core:
 
     def reachable(self) -> Ints:
         """Non-terminal states that an episode can reach; all episodes start in state 0."""
-        met: set[int] = set()
+        visited: set[int] = set()
         stack = [0]
         while stack:
-            if (state := stack.pop()) not in met:
-                met.add(state)
+            if (state := stack.pop()) not in visited:
+                visited.add(state)
                 stack += [int(s) for s in self.going[state][~self.over[state]]]
-        return np.array(sorted(met))
+        return np.array(sorted(visited))
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ class DistractorWorld:
     def tried(self, states: States, actions: Actions) -> float:
         """Share of the core's reachable (state, action) that occur in transitions [N]."""
         core = self.known
-        met = np.unique(np.column_stack([states[:, : core.values.shape[1]], actions]), axis=0)
-        return len(met) / core.going[core.reachable()].size
+        visited = np.unique(np.column_stack([states[:, : core.values.shape[1]], actions]), axis=0)
+        return len(visited) / core.going[core.reachable()].size
 
 
 class _DistractorEnv(gym.Env[Any, Any]):

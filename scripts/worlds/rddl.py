@@ -166,8 +166,8 @@ class RddlModel(ExactModel):
 
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
         """See TransitionModel."""
-        luck = uniforms(as_keys(rng, len(states)), states.shape[1])
-        return (luck < self._chances(states, actions)).astype(np.int64), np.zeros(len(states), dtype=np.bool_)
+        noise = uniforms(as_keys(rng, len(states)), states.shape[1])
+        return (noise < self._chances(states, actions)).astype(np.int64), np.zeros(len(states), dtype=np.bool_)
 
     def marginals(self, states: States, actions: Actions) -> Floats:
         """See TransitionModel."""

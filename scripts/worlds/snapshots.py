@@ -93,9 +93,9 @@ class SnapshotModel(ExactModel):
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
         """See TransitionModel."""
         found, keys = self.successors(states, actions, DRAWS, 0), as_keys(rng, len(states))
-        luck = np.array([np.random.default_rng(int(key)).random() for key in keys])
+        noise = np.array([np.random.default_rng(int(key)).random() for key in keys])
         cumulated = np.concatenate([[0.0], np.cumsum(found.probabilities)])
-        chosen = np.searchsorted(cumulated, cumulated[found.offsets[:-1]] + luck, side="right") - 1
+        chosen = np.searchsorted(cumulated, cumulated[found.offsets[:-1]] + noise, side="right") - 1
         chosen = np.clip(chosen, found.offsets[:-1], found.offsets[1:] - 1)
         return found.states[chosen], found.terminated[chosen]
 

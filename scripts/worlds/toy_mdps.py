@@ -98,9 +98,9 @@ def deep_sea(size: int = 10, slip: float = 0.0, seed: int = 0) -> TableEnv:
     for row, column in np.ndindex(size, size):
         ways: list[tuple[int, float, bool]] = []
         for step in (-1, 1):
-            last, beside = row == size - 1, min(max(column + step, 0), size - 1)
+            last, neighbour = row == size - 1, min(max(column + step, 0), size - 1)
             found = last and column == size - 1 and step == 1
-            ways.append((end if last else (row + 1) * size + beside, found - (step == 1) * 0.01 / size, last))
+            ways.append((end if last else (row + 1) * size + neighbour, found - (step == 1) * 0.01 / size, last))
         chosen = [int(right[row, column] == action) for action in (0, 1)]
         outcomes = [[(1.0 - slip, *ways[way])] + ([(slip, *ways[1 - way])] if slip else []) for way in chosen]
         table.append(outcomes)

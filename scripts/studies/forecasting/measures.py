@@ -83,5 +83,5 @@ def listed_states(model: BaseTransitionModel, start: States, most: int) -> State
         model.marginals(start[:1], np.zeros(1, dtype=np.int64))
     except NotImplementedError:
         return None
-    machine = model.reachable_mdp(start, max_states=most, n_samples=10_000)
-    return machine.states if machine.complete and not machine.terminated.any() else None
+    mdp = model.reachable_mdp(start, max_states=most, n_samples=10_000)
+    return mdp.states if mdp.complete and not mdp.terminated.any() else None

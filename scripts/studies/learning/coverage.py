@@ -48,10 +48,10 @@ class Cell:
 def reachable(exact: FiniteHorizonMDP) -> NDArray[np.int64]:
     """Numbers of the non-terminal states that an episode can reach."""
     steps = (exact.transitions > 0).any(axis=1)
-    met = exact.start > 0
-    while (more := met | (met @ steps)).sum() > met.sum():
-        met = more
-    return np.flatnonzero(met)
+    reached = exact.start > 0
+    while (more := reached | (reached @ steps)).sum() > reached.sum():
+        reached = more
+    return np.flatnonzero(reached)
 
 
 def outcomes(world: World, exact: FiniteHorizonMDP, numbers: NDArray[np.int64], actions: Actions) -> Successors:
@@ -112,8 +112,8 @@ def _exactly(world: World, agent: ModelLearningAgent) -> Callable[[], Row]:
     truth = outcomes(world, exact, some[:, 0], some[:, 1])
 
     def figures() -> Row:
-        met = agent.transitions.rows()
-        tried = np.unique(np.column_stack([met.before, met.actions]), axis=0)
+        observed = agent.transitions.rows()
+        tried = np.unique(np.column_stack([observed.before, observed.actions]), axis=0)
         span = exact.optimal_return() - exact.random_return()
         actions = agent.predict(exact.observations, deterministic=True)[0]
         return {
@@ -131,9 +131,9 @@ def _with_distractors(world: DistractorWorld, agent: ModelLearningAgent) -> Call
     some = pairs[np.random.default_rng(0).permutation(len(pairs))[:MAX_PAIRS]]
 
     def figures() -> Row:
-        met = agent.transitions.rows()
+        observed = agent.transitions.rows()
         error = world.wrongness(agent.model, some[:, 0], some[:, 1])
-        return {"tried": world.tried(met.states, met.actions), "error": error, "normalised": float("nan")}
+        return {"tried": world.tried(observed.states, observed.actions), "error": error, "normalised": float("nan")}
 
     return figures
 

@@ -69,10 +69,10 @@ class BayesNetModel(BaseTransitionModel):
 
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
         """See TransitionModel."""
-        luck = uniforms(as_keys(rng, len(states)), len(self._tables))
+        noise = uniforms(as_keys(rng, len(states)), len(self._tables))
         drawn = [
             (p.cumsum(axis=1) < u[:, None]).sum(axis=1).clip(0, p.shape[1] - 1)
-            for p, u in zip(self._distributions(states, actions), luck.T, strict=True)
+            for p, u in zip(self._distributions(states, actions), noise.T, strict=True)
         ]
         return np.stack(drawn[:-1], axis=1).astype(np.int64), drawn[-1] == 1
 

@@ -135,15 +135,15 @@ def build_task(seed: int, n_steps: int = 5000) -> NetworkTask:
     data = random_play(GeyserRunner(width=WIDTH, hit_cost=HIT_COST), n_steps, seed)
     model = NeuralTransitionModel(data.cardinalities, data.n_actions)
     model.fit(data, seed=seed)
-    met = data.rows().states
-    distinct = np.unique(met, axis=0)
+    observed = data.rows().states
+    distinct = np.unique(observed, axis=0)
     starts = distinct[np.random.default_rng(seed).permutation(len(distinct))[:N_STARTS]]
     goals, values = goals_of(N_GOALS), []
     for goal in goals:
         states, q = exact_values(goal, NetworkTask.gamma)
         place = {state.tobytes(): i for i, state in enumerate(states)}
         values.append(q[[place[state.tobytes()] for state in starts]])
-    return NetworkTask(data, model, goals, np.stack(values), starts, met[:: max(1, len(met) // 16)][:16])
+    return NetworkTask(data, model, goals, np.stack(values), starts, observed[:: max(1, len(observed) // 16)][:16])
 
 
 def pruned(task: NetworkTask, fraction: float, seed: int) -> NetworkTask:
@@ -208,6 +208,6 @@ def run_networks_in_mctx(python: Path, task: NetworkTask, repetitions: int = 5) 
         path = Path(folder) / "networks.npz"
         asked = {"speeds": speeds, "repetitions": np.asarray(repetitions), "budgets": np.array(BUDGETS), "seeds": np.array(SEEDS)}
         np.savez(path, allow_pickle=False, **exported(task), **asked)
-        told = run_script(python, "mctx_networks", [str(path)])
-    choices = {int(n): np.array(actions, dtype=np.int64) for n, actions in told["choices"].items()}
-    return PeerOnNetworks([Speed(**speed) for speed in told["speeds"]], choices, np.array(told["mean_next_state"]))
+        output = run_script(python, "mctx_networks", [str(path)])
+    choices = {int(n): np.array(actions, dtype=np.int64) for n, actions in output["choices"].items()}
+    return PeerOnNetworks([Speed(**speed) for speed in output["speeds"]], choices, np.array(output["mean_next_state"]))

@@ -58,7 +58,7 @@ def on_machine(world: RandomMDP) -> TableSearch:
     """Tree search on the MDP as a known reachable MDP."""
     model = as_model(world)
     following, over = model.next_states, model.terminated
-    machine = known_machine(
+    mdp = known_machine(
         model.offsets,
         following,
         model.probabilities,
@@ -70,7 +70,7 @@ def on_machine(world: RandomMDP) -> TableSearch:
     )
 
     def search(roots: Ints, n_simulations: int, seed: int) -> tuple[Ints, int]:
-        found = search_machine(machine, roots, n_simulations, seed)
+        found = search_machine(mdp, roots, n_simulations, seed)
         return best_actions(found.values), found.steps
 
     return search

@@ -123,12 +123,12 @@ def run_peer(
             speeds=np.array(speeds, dtype=np.int64).reshape(-1, 2),
             repetitions=np.array(repetitions),
         )
-        told = run_script(python, script, [str(path)])
+        output = run_script(python, script, [str(path)])
     return [
         PeerResult(
             name,
             {int(n): np.array(actions, dtype=np.int64) for n, actions in result["choices"].items()},
             [Speed(**speed) for speed in result["speeds"]],
         )
-        for name, result in told.items()
+        for name, result in output.items()
     ]

@@ -63,8 +63,8 @@ def flier_catcher_dependencies(game: FlierCatcher) -> tuple[Bools, Bools]:
     states = np.zeros((number.size, number.size), dtype=np.bool_)
     others = np.zeros_like(states)
     for row in range(game.height):
-        for beside in range(max(row - 1, 0), min(row + 2, game.height)):
-            states[number[0, row, 0], number[0, beside, 0]] = game.stay or beside != row or row in (0, game.height - 1)
+        for neighbour in range(max(row - 1, 0), min(row + 2, game.height)):
+            states[number[0, row, 0], number[0, neighbour, 0]] = game.stay or neighbour != row or row in (0, game.height - 1)
         states[number[1, row, :-1], number[1, row, 1:]] = True
         others[number[1, row, -1], number[1, :row, -1]] = True
     return states, others

@@ -96,7 +96,7 @@ def test_a_measure_is_used_only_where_it_exists_for_every_score() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "message"),
     [
         (["--steps", "0"], "n = 1, 2"),
         (["--games", "Chess"], "no game 'Chess'"),
@@ -108,6 +108,6 @@ def test_a_measure_is_used_only_where_it_exists_for_every_score() -> None:
         (["--workers", "0"], "at least 1 process"),
     ],
 )
-def test_mistakes_get_one_sentence(wrong: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_get_one_sentence(wrong: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*wrong, "--output", str(tmp_path)]) == 1
-    assert told in capsys.readouterr().out
+    assert message in capsys.readouterr().out

@@ -44,10 +44,10 @@ def test_the_script_writes_table_and_picture_and_refuses_what_it_does_not_know(
     assert float(rows["random", 600]["tried"]) < 0.7
     assert float(rows["auto", 600]["error"]) < float(rows["random", 600]["error"])
     assert (tmp_path / "coverage.png").read_bytes()[:4] == b"\x89PNG"
-    for wrong, told in (
+    for wrong, expected in (
         (["--explorations", "bold"], "bold"),
         (["--worlds", "CartPole, binned"], "not available"),
         (["--marks", "20", "10"], "ascending"),
     ):
         assert main(wrong) == 1
-        assert told in capsys.readouterr().out
+        assert expected in capsys.readouterr().out

@@ -50,7 +50,7 @@ def test_a_small_run_is_written_and_shown(tmp_path: Path, capsys: pytest.Capture
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "expected"),
     [
         (["--cases", "Chess"], "no case 'Chess'"),
         (["--models"], "at least one model"),
@@ -61,6 +61,6 @@ def test_a_small_run_is_written_and_shown(tmp_path: Path, capsys: pytest.Capture
         (["--workers", "0"], "at least 1 process"),
     ],
 )
-def test_mistakes_get_one_sentence(wrong: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_get_one_sentence(wrong: list[str], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*wrong, "--output", str(tmp_path / "new")]) == 1
-    assert told in capsys.readouterr().out.replace("\n", " ")
+    assert expected in capsys.readouterr().out.replace("\n", " ")

@@ -178,7 +178,7 @@ def test_settings_come_back_from_disk(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "expected"),
     [
         (["--trials", "9"], "no trial '9'"),
         (["--trials", "d = 2"], "no trial 'd = 2'"),
@@ -192,9 +192,9 @@ def test_settings_come_back_from_disk(tmp_path: Path) -> None:
         (["--report-only"], "no results"),
     ],
 )
-def test_mistakes_get_one_sentence(wrong: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_get_one_sentence(wrong: list[str], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*wrong, "--output", str(tmp_path / "new")]) == 1
-    assert told in capsys.readouterr().out
+    assert expected in capsys.readouterr().out
     assert not (tmp_path / "new").exists()  # no run was started
 
 
