@@ -107,9 +107,9 @@ class TwoPlayers(BoardWorld):
         before, after = self.planes(obs), self.planes(following)
         row, cell = np.nonzero(before[:, 0])
         target, inside = self.step(cell, actions[row])
-        goes = inside & (before[row, 1, target] == 0)
+        moves = inside & (before[row, 1, target] == 0)
         after[:, 0] = 0
-        after[row, 0, np.where(goes, target, cell)] = 1
+        after[row, 0, np.where(moves, target, cell)] = 1
         return following
 
 
@@ -139,8 +139,8 @@ class PushedBox(BoardWorld):
         behind, beyond = self.step(target, actions)
         pushes = inside & (target == box)
         room = beyond & (before[rows, 1, behind] == 0)
-        goes = inside & (before[rows, 1, target] == 0) & (~pushes | room)
-        moved, pushed = np.flatnonzero(goes), np.flatnonzero(goes & pushes)
+        moves = inside & (before[rows, 1, target] == 0) & (~pushes | room)
+        moved, pushed = np.flatnonzero(moves), np.flatnonzero(moves & pushes)
         after[moved, 0], after[pushed, 2] = 0, 0
         after[moved, 0, target[moved]] = 1
         after[pushed, 2, behind[pushed]] = 1

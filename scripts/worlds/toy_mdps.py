@@ -96,13 +96,13 @@ def deep_sea(size: int = 10, slip: float = 0.0, seed: int = 0) -> TableEnv:
     right, end = np.random.default_rng(seed).integers(2, size=(size, size)), size * size
     table: list[list[list[Outcome]]] = []
     for row, column in np.ndindex(size, size):
-        ways: list[tuple[int, float, bool]] = []
+        moves: list[tuple[int, float, bool]] = []
         for step in (-1, 1):
             last, neighbour = row == size - 1, min(max(column + step, 0), size - 1)
             found = last and column == size - 1 and step == 1
-            ways.append((end if last else (row + 1) * size + neighbour, found - (step == 1) * 0.01 / size, last))
+            moves.append((end if last else (row + 1) * size + neighbour, found - (step == 1) * 0.01 / size, last))
         chosen = [int(right[row, column] == action) for action in (0, 1)]
-        outcomes = [[(1.0 - slip, *ways[way])] + ([(slip, *ways[1 - way])] if slip else []) for way in chosen]
+        outcomes = [[(1.0 - slip, *moves[way])] + ([(slip, *moves[1 - way])] if slip else []) for way in chosen]
         table.append(outcomes)
     table.append([[(1.0, end, 0.0, True)]] * 2)
     planes = np.eye(end + 1, end, dtype=np.int8).reshape(-1, size, size)

@@ -1,4 +1,4 @@
-"""Learns each game by random play, forecasts 1 ... n steps in both ways, and compares with the game itself."""
+"""Learns each game by random play, forecasts 1 ... n steps with both methods, and compares with the game itself."""
 
 from __future__ import annotations
 

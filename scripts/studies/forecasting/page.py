@@ -81,7 +81,7 @@ def write_page(path: Path, results: Tables, settings: Settings, command: str) ->
     """Writes the HTML page with its picture into one file; returns the picture as PNG."""
     found = tables(results["results"], results.get("returns", []))
     figure = draw_errors(found)
-    about = "Error of both ways of forecasting against the number of steps, one panel for each game"
+    about = "Error of both forecasting methods against the number of steps, one panel for each game"
     note = (
         "Means over seeds with 95% t intervals. Total variation of the joint distribution is exact, over all states of the "
         f"game. If there are too many states, it is the share of {settings.n_draws} samples that miss the only possible state, "

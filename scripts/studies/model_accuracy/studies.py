@@ -156,11 +156,11 @@ def parents(seed: int, full: bool) -> list[Row]:
         model = learned(flat, int(game.action_space.n), random_play(game, steps, seed, np.arange(len(space))))
         assert isinstance(model, DecisionGraphModel)
         layout = model.fitted.layout
-        units = [layout.members[a:b] for a, b in itertools.pairwise(layout.first[:-2])]
-        true, found = true_parents(game, units, seed), np.zeros((len(units), len(units)), dtype=np.bool_)
-        for v in range(len(units)):
-            asked = parent_factors(layout, tested_features(model.fitted.usual, v))
-            found[v] = [bool(asked & set(members.tolist())) for members in units]
+        groups = [layout.members[a:b] for a, b in itertools.pairwise(layout.first[:-2])]
+        true, found = true_parents(game, groups, seed), np.zeros((len(groups), len(groups)), dtype=np.bool_)
+        for v in range(len(groups)):
+            tested = parent_factors(layout, tested_features(model.fitted.usual, v))
+            found[v] = [bool(tested & set(members.tolist())) for members in groups]
         np.fill_diagonal(found, False)
         hits = int((found & true).sum())
         shares = {"precision": hits / found.sum() if found.any() else NAN, "recall": hits / true.sum() if true.any() else NAN}
@@ -168,7 +168,7 @@ def parents(seed: int, full: bool) -> list[Row]:
     return rows
 
 
-def true_parents(game: Game, units: Sequence[Ints], seed: int, n: int = 3000) -> Bools:
+def true_parents(game: Game, groups: Sequence[Ints], seed: int, n: int = 3000) -> Bools:
     """True dependencies between variables, bool [U, U], found by changing one at a time in states of random play.
 
     Bits are flipped, mutex groups get another bit, with the same random numbers before and after. Steps that redraw almost all
@@ -180,8 +180,8 @@ def true_parents(game: Game, units: Sequence[Ints], seed: int, n: int = 3000) ->
     normal, _ = true.sample(rows.states, rows.actions, keys)
     counts = (normal != rows.states).sum(axis=1)
     most = 2.0 * max(1.0, float(np.quantile(counts, 0.95)))
-    found = np.zeros((len(units), len(units)), dtype=np.bool_)
-    for u, members in enumerate(units):
+    found = np.zeros((len(groups), len(groups)), dtype=np.bool_)
+    for u, members in enumerate(groups):
         changed = rows.states.copy()
         if len(members) == 1:
             changed[:, members[0]] ^= 1
@@ -191,7 +191,7 @@ def true_parents(game: Game, units: Sequence[Ints], seed: int, n: int = 3000) ->
         other, _ = true.sample(changed, rows.actions, keys)
         few = (counts <= most) & ((other != changed).sum(axis=1) <= most)
         differs = (normal != other)[few & valid].sum(axis=0) > 2
-        found[:, u] = [bool(differs[own].any()) for own in units]
+        found[:, u] = [bool(differs[own].any()) for own in groups]
     np.fill_diagonal(found, False)
     return found
 

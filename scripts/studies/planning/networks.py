@@ -206,8 +206,8 @@ def run_networks_in_mctx(python: Path, task: NetworkTask, repetitions: int = 5) 
     speeds = np.array([(n_roots, budget) for budget in BUDGETS for n_roots in AT_ONCE])
     with TemporaryDirectory() as folder:
         path = Path(folder) / "networks.npz"
-        asked = {"speeds": speeds, "repetitions": np.asarray(repetitions), "budgets": np.array(BUDGETS), "seeds": np.array(SEEDS)}
-        np.savez(path, allow_pickle=False, **exported(task), **asked)
+        query = {"speeds": speeds, "repetitions": np.asarray(repetitions), "budgets": np.array(BUDGETS), "seeds": np.array(SEEDS)}
+        np.savez(path, allow_pickle=False, **exported(task), **query)
         output = run_script(python, "mctx_networks", [str(path)])
     choices = {int(n): np.array(actions, dtype=np.int64) for n, actions in output["choices"].items()}
     return PeerOnNetworks([Speed(**speed) for speed in output["speeds"]], choices, np.array(output["mean_next_state"]))

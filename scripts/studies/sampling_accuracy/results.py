@@ -53,7 +53,7 @@ def load_points(path: Path) -> Points:
         with np.load(path, allow_pickle=False) as archive:
             pairs = {name: archive[name] for name in archive}
     except (OSError, EOFError, ValueError, BadZipFile) as error:
-        raise ValueError(f"{path} cannot be read ({error}); delete it, or measure anew without --resume.") from error
+        raise ValueError(f"{path} cannot be read ({error}); delete it, or measure again without --resume.") from error
     return {(name.partition("|")[0], name.partition("|")[2]): value for name, value in pairs.items()}
 
 
@@ -77,7 +77,7 @@ def load_scores(path: Path) -> list[Score]:
                 find_trial(scores[-1].trial)
     except ValueError as error:
         line = len(scores) + 2
-        raise ValueError(f"{path} cannot be read (line {line}: {error}); mend or delete it, or measure anew.") from error
+        raise ValueError(f"{path} cannot be read (line {line}: {error}); repair or delete it, or measure again.") from error
     return scores
 
 
@@ -99,4 +99,4 @@ def load_settings(path: Path) -> Settings:
         given: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in kept.items()}
         return Settings(**{**given, "fit": FitOptions(**kept["fit"])})
     except (ValueError, TypeError, KeyError) as error:
-        raise ValueError(f"{path} cannot be read ({error}); measure anew without --resume.") from error
+        raise ValueError(f"{path} cannot be read ({error}); measure again without --resume.") from error
