@@ -1,17 +1,17 @@
-"""Measures planning and sampling beside other packages: regret and speed on the same worlds.
+"""Compares planning and sampling with other packages: regret and speed in the same environments.
 
 python scripts/benchmark_planner.py                                        # without other packages
-python scripts/benchmark_planner.py --peers-python peers/bin/python        # beside mctx, LightZero and gymcts
+python scripts/benchmark_planner.py --peers-python peers/bin/python        # with mctx, LightZero and gymcts
 python scripts/benchmark_planner.py --parts naive "short cut"
 
-The peers want an environment of their own; pyproject.toml, extra "peers", says how to make it.
+The peers need a Python environment of their own; pyproject.toml, extra "peers", describes how to create it.
 """
 
 from __future__ import annotations
 
 import os
 
-# Before NumPy and torch are imported: everything is timed on one thread.
+# Set before NumPy and torch are imported: everything is timed on one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import sys
@@ -39,7 +39,7 @@ from worlds.synthetic_dbn import Sampler, trained
 
 Say = Callable[[str], None]
 PRUNED = 0.9
-"""Share of the connections that the pruned networks have lost at least."""
+"""Smallest share of connections removed from the pruned networks."""
 
 PARTS = ("quality", "crowds", "decisions", "start", "memory", "regret", "naive", "short cut", "networks")
 
@@ -49,30 +49,30 @@ class Args:
     """Measure planning and sampling."""
 
     parts: tuple[str, ...] = PARTS
-    """What to measure: quality of play (crowds: among many noisy variables), cost of decisions, start of a process, memory,
+    """Parts to measure: quality of play (crowds: with many noisy variables), cost of decisions, start of a process, memory,
     regret (and speed of searches), naive, short cut, networks."""
     full: bool = False
-    """5 agents of each kind, learned ones too, instead of 1 with the true model."""
+    """5 agents of each kind, with learned and true models, instead of 1 with the true model."""
     peers_python: Path | None = None
-    """Python of the environment that has the peers; without it they are left out."""
+    """Python interpreter of the peers' environment; without it the peers are skipped."""
     worlds: int = Settings.worlds
-    """Random worlds of each kind."""
+    """Random MDPs of each kind."""
     roots: int = Settings.roots
-    """Roots in each world."""
+    """Roots in each MDP."""
     seeds: int = Settings.seeds
-    """Searches from each root with each budget."""
+    """Searches per root and budget."""
     budgets: tuple[int, ...] = Settings.budgets
     """Simulations."""
     first_seed: int = 0
     """Of everything random."""
     draws: int = 4000
-    """Draws from each input on which full sweeps and the short cut are compared."""
+    """Samples per input with which full sweeps and the short cut are compared."""
     output: Path = Path("results/planning")
-    """Folder for the tables and report.html; results of an earlier run there are moved to a folder of their own inside it."""
+    """Folder for the tables and report.html; results of an earlier run are moved to a subfolder."""
 
 
 def measure_quality(args: Args, say: Say) -> Tables:
-    """Play with true models and, with ``--full``, with learned ones, against the best there is."""
+    """Play with true models and, with ``--full``, with learned ones, compared with the best known policy."""
     seeds, rows = range(args.first_seed + 1000, args.first_seed + 1000 + (5 if args.full else 1)), []
     for name in TOY_TEXT:
         rows.append(summary([play_table(name, seed) for seed in seeds]))
@@ -84,7 +84,7 @@ def measure_quality(args: Args, say: Say) -> Tables:
 
 
 def measure_crowds(args: Args, say: Say) -> Tables:
-    """Planning among many noisy variables, without and with values learned in imagination."""
+    """Planning with many noisy variables, without and with a fitted value function."""
     rows: list[Row] = []
     for make in COUPLED:
         world = make()
@@ -94,7 +94,7 @@ def measure_crowds(args: Args, say: Say) -> Tables:
 
 
 def measure_decisions(args: Args, say: Say) -> Tables:
-    """Milliseconds of a decision beside PPO's."""
+    """Milliseconds per decision, compared with PPO."""
     found, rows = scales(say), []
     for setting in SETTINGS:
         say(f"decisions: {setting.key}")
@@ -121,14 +121,14 @@ def measure_memory(args: Args, say: Say) -> Tables:
 
 
 def measure_regret(args: Args, say: Say) -> Tables:
-    """Regret and speed of searches on tables."""
+    """Regret and speed of searches in tabular MDPs."""
     settings = Settings(args.worlds, args.roots, args.seeds, args.first_seed, args.budgets, args.peers_python)
     regrets, speeds = compare(settings, say=say)
     return {"regret": [asdict(row) for row in regrets], "speed": [asdict(row) for row in speeds]}
 
 
 def measure_naive(args: Args, say: Say) -> Tables:
-    """The compiled samplers beside the naive procedure."""
+    """The compiled samplers compared with the naive procedure."""
     rows: list[Row] = []
     for sampler in get_args(Sampler):
         say(f"naive: {sampler}")
@@ -138,7 +138,7 @@ def measure_naive(args: Args, say: Say) -> Tables:
 
 
 def measure_short_cut(args: Args, say: Say) -> Tables:
-    """Sweeps over what is uncertain beside sweeps over everything."""
+    """Sweeps over the uncertain variables only, compared with sweeps over all."""
     rows: list[Row] = []
     for d in (32, 128):
         say(f"short cut: {d} bits")
@@ -148,7 +148,7 @@ def measure_short_cut(args: Args, say: Say) -> Tables:
 
 
 def measure_networks(args: Args, say: Say) -> Tables:
-    """Searches through learned networks, whole and pruned."""
+    """Searches with learned networks, full and pruned."""
     say("networks: learning the game")
     task = build_task(args.first_seed)
     tasks, own = (task, pruned(task, PRUNED, args.first_seed)), []
@@ -189,7 +189,7 @@ def check(args: Args, run: Run | None = None) -> tuple[str, ...]:
     """The parts to measure.
 
     Raises:
-        ValueError: nothing can be measured with these options.
+        ValueError: an option is invalid.
     """
     check_known("part", args.parts, PARTS)
     if min(args.worlds, args.roots, args.seeds, *args.budgets) < 1:
@@ -198,7 +198,7 @@ def check(args: Args, run: Run | None = None) -> tuple[str, ...]:
 
 
 def execute(args: Args, parts: tuple[str, ...], run: Run) -> None:
-    """Measures one part after another, all in this process: they are timed."""
+    """Measures the parts one after another in this process, since they are timed."""
     torch.set_num_threads(1)
     tables: Tables = {}
     for part in parts:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import os
 
-# Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
+# Set before NumPy and torch are imported: work is parallel over processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# Pictures are drawn without a window or sound, so that machines without a screen have nothing to complain about.
+# Pictures are drawn without a window or sound, so that no display is needed.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
 
@@ -37,7 +37,7 @@ class Args:
     full: bool = False
     """Five trainings, more episodes, and the baselines also at ten times the steps (hours, not minutes)."""
     output: Path = Path("results/compare")
-    """Folder for report.html, results.csv and the records of every training."""
+    """Folder for report.html, results.csv and the records of all trainings."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Number of processes, each with one thread."""
     cases: tuple[str, ...] = tuple(case.key for case in CASES)
@@ -47,28 +47,28 @@ class Args:
     seeds: int | None = None
     """Independent trainings of each agent; by default 2, with --full 5."""
     episodes: int | None = None
-    """Episodes after each training, more where there are few states; by default 10, with --full 20."""
+    """Episodes after each training, more in environments with few states; by default 10, with --full 20."""
     goal_seeds: int | None = None
-    """Trainings on which new goals and the learned reward are tried; by default 1, with --full 5."""
+    """Trainings that are evaluated on new goals and with the learned reward; by default 1, with --full 5."""
     goal_episodes: int | None = None
     """Episodes for each new goal; by default 4, with --full 20."""
     baselines: tuple[str, ...] = BASELINES
-    """Which agents to compare with; none after a bare --baselines."""
+    """Agents to compare with; none after --baselines without values."""
     baseline_multiples: tuple[int, ...] | None = None
-    """Baselines train for these multiples of the steps; by default 1, with --full 1 and 10."""
+    """The baselines are trained for these multiples of the steps; by default 1, with --full 1 and 10."""
     curves: bool = True
     """Whether the agent is also trained for fewer steps, for its learning curve."""
     resume: bool = False
-    """Go on with an interrupted run of the same settings instead of starting anew."""
+    """Continue an interrupted run with the same settings instead of starting again."""
     report_only: bool = False
-    """Only write the report anew, from the records of the last run there, with that run's settings."""
+    """Only rewrite the report, from the records and settings of the last run in the folder."""
 
 
 _OVERRIDES = ("steps", "seeds", "episodes", "goal_seeds", "goal_episodes", "baselines", "baseline_multiples")
 
 
 def settings_of(args: Args) -> Settings:
-    """The comparison's settings that the options stand for."""
+    """The settings of the comparison given by the options."""
     chosen = FULL if args.full else QUICK
     given: dict[str, Any] = {name: getattr(args, name) for name in _OVERRIDES}
     chosen = replace(chosen, **{name: value for name, value in given.items() if value is not None})
@@ -79,7 +79,7 @@ def settings_of(args: Args) -> Settings:
 
 
 Records: TypeAlias = tuple[Settings, list[Record], float]
-"""The settings of a comparison, its records, and the minutes it took."""
+"""Settings of a comparison, its records, and its duration in minutes."""
 
 
 def prepare(args: Args, run: Run) -> Records:
@@ -97,9 +97,9 @@ def prepare(args: Args, run: Run) -> Records:
 
 
 def execute(args: Args, found: Records, run: Run) -> None:
-    """Sums up and draws."""
+    """Summarises the records and writes the report."""
     settings, records, minutes = found
-    run.say("Summing up and drawing ...")
+    run.say("Writing the report ...")
     results = summarise(records, settings)
     save_csv(args.output / "results.csv", records, results)
     write_report(args.output / "report.html", results, settings, command=run.command, minutes=minutes)

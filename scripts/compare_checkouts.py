@@ -3,9 +3,9 @@
 python scripts/compare_checkouts.py OLD NEW              # three seeds; about ten minutes each on one core
 python scripts/compare_checkouts.py OLD NEW --seeds 1 --cases "FrozenLake, auto"
 
-Experience, weights, draws, probabilities, successors and plans are compared. Both checkouts run with this Python and its
-libraries, one after the other. A refactoring that changes no number prints "equal" for each case. Names of arrays are not
-compared, only what they hold, so that they may be renamed.
+Experience, weights, samples, probabilities, successors and plans are compared. Both checkouts run with this Python and its
+libraries, one after the other. A refactoring that changes no number prints "equal" for each case. Only the contents of arrays
+are compared, not their names, so that arrays may be renamed.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 
 STEPS = 1500
-"""Environment steps learned from."""
+"""Environment steps for learning."""
 
 N_ROWS = 40
-"""Observed states that are asked about."""
+"""Number of observed states for which predictions are compared."""
 
 CASES: Mapping[str, tuple[str, str, str]] = {
     "GeyserRunner, auto": ("mbagent/GeyserRunner-v0", "auto", "MctsPolicy"),
@@ -48,7 +48,7 @@ CASES: Mapping[str, tuple[str, str, str]] = {
 
 
 def digest(*arrays: Any) -> str:
-    """What arrays hold, with their types and shapes."""
+    """Digest of the contents, types and shapes of arrays."""
     found = hashlib.sha256()
     for array in map(np.ascontiguousarray, arrays):
         found.update(f"{array.dtype} {array.shape} ".encode() + array.tobytes())
@@ -56,8 +56,8 @@ def digest(*arrays: Any) -> str:
 
 
 def make(name: str) -> Any:
-    """An environment; "store" is two stocks with random demand, whose rewards are known from the environment alone."""
-    import gymnasium as gym  # noqa: PLC0415 (of the checkout's process)
+    """Creates an environment; "store" has two stocks with random demand and no ``reward_fn``."""
+    import gymnasium as gym  # noqa: PLC0415 (imported in the checkout's process)
 
     if name != "store":
         return gym.make("Taxi-v4" if name.startswith("Taxi") and "Taxi-v4" in gym.registry else name)
@@ -81,8 +81,8 @@ def make(name: str) -> Any:
 
 
 def probe(case: str, seed: int) -> dict[str, str]:
-    """Digests of all that a case computes."""
-    from mbagent import LearnedEnv, ModelLearningAgent  # noqa: PLC0415 (of the checkout that is asked)
+    """Digests of all results of a case."""
+    from mbagent import LearnedEnv, ModelLearningAgent  # noqa: PLC0415 (of the checkout under test)
 
     env_id, model, policy = CASES[case]
     env = make(env_id)
@@ -92,7 +92,7 @@ def probe(case: str, seed: int) -> dict[str, str]:
     some = np.linspace(0, len(rows) - 1, N_ROWS).astype(np.int64)
     states, actions = rows.states[some], rows.actions[some]
     found = {"experience": digest(rows.states, rows.actions, rows.next_states, rows.terminated)}
-    found |= asked_of(agent.model, states, actions, rows.next_states[some], rows.terminated[some], seed)
+    found |= model_digests(agent.model, states, actions, rows.next_states[some], rows.terminated[some], seed)
     found["plans"] = plans(agent, states)
     learned = LearnedEnv(agent)
     learned.reset(seed=seed)
@@ -102,13 +102,13 @@ def probe(case: str, seed: int) -> dict[str, str]:
     if model in ("networks", "paper"):
         agent.prune(0.8)
         found["pruned plans"] = plans(agent, states[:4])
-        asked = asked_of(agent.model, states, actions, rows.next_states[some], rows.terminated[some], seed)
-        found |= {f"pruned {name}": value for name, value in asked.items()}
+        digests = model_digests(agent.model, states, actions, rows.next_states[some], rows.terminated[some], seed)
+        found |= {f"pruned {name}": value for name, value in digests.items()}
     return found
 
 
-def asked_of(model: Any, states: Any, actions: Any, following: Any, ends: Any, seed: int) -> dict[str, str]:
-    """Digests of a model's weights and of what it says of some transitions."""
+def model_digests(model: Any, states: Any, actions: Any, following: Any, ends: Any, seed: int) -> dict[str, str]:
+    """Digests of a model's weights and of its predictions for some transitions."""
     found = {"weights": digest(*sorted((np.asarray(a) for a in model.state_dict().values()), key=digest))}
     found["marginals"] = digest(model.marginals(states, actions))
     found["sample"] = digest(*model.sample(states, actions, np.random.default_rng(seed)))
@@ -122,7 +122,7 @@ def asked_of(model: Any, states: Any, actions: Any, following: Any, ends: Any, s
 
 
 def plans(agent: Any, states: Any) -> str:
-    """What is decided in some states, and why."""
+    """Digest of the decisions in some states, with their explanations."""
     space = agent.policy.factored
     observations = space.decode(states[:12])
     chosen, _ = agent.predict(observations, deterministic=True)
@@ -131,8 +131,8 @@ def plans(agent: Any, states: Any) -> str:
     return digest(chosen, why.values, why.errors, why.visits, why.chosen)
 
 
-def ask(args: argparse.Namespace) -> dict[str, dict[str, str]]:
-    """All cases and seeds in this process."""
+def compute(args: argparse.Namespace) -> dict[str, dict[str, str]]:
+    """Digests of all cases and seeds, computed in this process."""
     import torch  # noqa: PLC0415
 
     torch.set_num_threads(1)
@@ -146,7 +146,7 @@ def ask(args: argparse.Namespace) -> dict[str, dict[str, str]]:
 
 
 def run(checkout: Path, args: argparse.Namespace) -> dict[str, dict[str, str]]:
-    """The same with the code of a checkout, in a process of its own."""
+    """The same with the code of a checkout, in a separate process."""
     folders = [str(checkout.resolve()), str(checkout.resolve() / "envs")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(folders), "OMP_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as folder:
@@ -158,7 +158,7 @@ def run(checkout: Path, args: argparse.Namespace) -> dict[str, dict[str, str]]:
 
 
 def main() -> int:
-    """Runs the command line; 1 if anything differs."""
+    """Runs the command line; returns 1 if anything differs."""
     parser = argparse.ArgumentParser(description="Compares two checkouts byte for byte.")
     parser.add_argument("checkouts", nargs="*", type=Path, help="two folders")
     parser.add_argument("--seeds", type=int, default=3)
@@ -166,7 +166,7 @@ def main() -> int:
     parser.add_argument("--write", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.write is not None:
-        args.write.write_text(json.dumps(ask(args)), encoding="utf-8")
+        args.write.write_text(json.dumps(compute(args)), encoding="utf-8")
         return 0
     if len(args.checkouts) != 2:
         parser.error("name two checkouts")

@@ -1,4 +1,4 @@
-"""Draws the picture of the three games that the README shows.
+"""Draws the README's picture of the three games.
 
 python scripts/draw_games.py
 """
@@ -31,9 +31,9 @@ class Args:
     """Draw the three games, each after some steps of its reference player."""
 
     output: Path = Path("docs/images/games.png")
-    """Where the picture goes."""
+    """File of the picture."""
     steps: int = 31
-    """Steps played before the picture is taken."""
+    """Steps played before the picture is drawn."""
     seed: int = 8
     """Which episode."""
 

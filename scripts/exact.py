@@ -1,4 +1,4 @@
-"""Exact values of worlds that are known as arrays: expected returns of whole episodes, and discounted values of actions."""
+"""Exact values of MDPs given as arrays: expected returns of whole episodes, and discounted action values."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from mbagent.types import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class FiniteHorizonMDP:
-    """A world as tables, with a limit of steps.
+    """An MDP given as tables, with a step limit.
 
     Attributes:
-        observations: of its S states, [S, ...].
-        transitions: probability of each next state where the episode goes on, float64 [S, A, S].
-        rewards: expected, float64 [S, A].
-        start: probability that an episode starts there, float64 [S].
+        observations: observations of its S states, [S, ...].
+        transitions: probability of each next state with the episode continuing, float64 [S, A, S].
+        rewards: expected rewards, float64 [S, A].
+        start: probability that an episode starts in each state, float64 [S].
         horizon: steps after which an episode is truncated.
     """
 
@@ -32,7 +32,7 @@ class FiniteHorizonMDP:
     horizon: int
 
     def optimal_return(self) -> float:
-        """The best expected return, knowing how many steps are left."""
+        """The highest expected return of a policy that knows the number of remaining steps."""
         return self._backward_induction(lambda values: (self.rewards + self.transitions @ values).max(axis=1))
 
     def random_return(self) -> float:
@@ -44,13 +44,13 @@ class FiniteHorizonMDP:
         return self._return_of(np.eye(self.rewards.shape[1])[actions])
 
     def _return_of(self, shares: Floats) -> float:
-        """Expected return of a policy that takes actions with these probabilities [S, A]."""
+        """Expected return of a policy with these action probabilities [S, A]."""
         rewards = (shares * self.rewards).sum(axis=1)
         transitions = np.einsum("sa,san->sn", shares, self.transitions)
         return self._backward_induction(lambda values: rewards + transitions @ values)
 
     def _backward_induction(self, backup: Callable[[Floats], Floats]) -> float:
-        """Expected return from the start; ``backup`` turns values [S] with n steps left into those with n + 1."""
+        """Expected return from the start; ``backup`` computes values [S] with n + 1 steps left from those with n."""
         values = np.zeros(len(self.start))
         for _ in range(self.horizon):
             values = backup(values)
@@ -58,15 +58,15 @@ class FiniteHorizonMDP:
 
 
 def toy_text_mdp(env: gym.Env[Any, Any]) -> FiniteHorizonMDP:
-    """A toy_text environment, or another with tables like theirs, as arrays.
+    """A toy_text environment, or another one with the same kind of tables, as arrays.
 
     Args:
         env: an environment with ``unwrapped.P[state][action] -> [(probability, next state, reward, terminated)]`` and
-            ``unwrapped.initial_state_distrib``. Where an observation is not the state's number, ``unwrapped.observations``
+            ``unwrapped.initial_state_distrib``. If an observation is not the state's number, ``unwrapped.observations``
             [S, ...] holds one for each state.
 
     Raises:
-        ValueError: it has no step limit.
+        ValueError: the environment has no step limit.
     """
     if env.spec is None or env.spec.max_episode_steps is None:
         raise ValueError("The environment has no step limit; give gym.make max_episode_steps.")
@@ -85,15 +85,15 @@ def toy_text_mdp(env: gym.Env[Any, Any]) -> FiniteHorizonMDP:
 def optimal_q(
     successors: Ints, probabilities: Floats, rewards: Floats, ends: Bools | None, gamma: float, tolerance: float = 0.0
 ) -> Floats:
-    """Discounted values of the actions, float64 [S, A], by value iteration; nothing is earned after a terminated state.
+    """Discounted action values, float64 [S, A], by value iteration; no rewards follow a terminated state.
 
     Args:
-        successors: of each (state, action), int64 [S, A, K].
-        probabilities: of them, float64 [S, A, K].
+        successors: next states of each (state, action), int64 [S, A, K].
+        probabilities: their probabilities, float64 [S, A, K].
         rewards: on arrival in each state, float64 [S].
-        ends: whether arrival there terminates, bool [S]; None where no episode ends.
-        gamma: discount of a step.
-        tolerance: the largest change of the last sweep; 0 for machine precision, 1e-13 of the largest value.
+        ends: whether arrival in a state terminates, bool [S]; None if no episode terminates.
+        gamma: discount factor.
+        tolerance: largest change in the last sweep; 0 for machine precision, 1e-13 of the largest value.
     """
     q = np.zeros(successors.shape[:2])
     while True:

@@ -1,4 +1,4 @@
-"""Draws what exploration has tried, and how wrong the model is by then, against steps: the agent's default beside random steps.
+"""Plots coverage of exploration and model error against steps: the agent's default compared with random actions.
 
 python scripts/exploration.py                                       # quick: three worlds, one seed
 python scripts/exploration.py --worlds SysAdmin Navigation --seeds 3
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 
-# Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
+# Set before NumPy and torch are imported: work is parallel over processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import sys
@@ -30,11 +30,11 @@ class Args:
     """Compare explorations."""
 
     worlds: tuple[str, ...] = ("FrozenLake 8x8", "CliffWalking", "Taxi")
-    """Which environments: those of the benchmark whose rules are known, or made-up ones (worlds.distractors)."""
+    """Environments: those of the benchmark with known rules, or constructed ones (worlds.distractors)."""
     explorations: tuple[str, ...] = ("random", "auto")
     """Which explorations."""
     marks: tuple[int, ...] = (500, 1000, 2000, 5000, 10_000, 20_000)
-    """Environment steps after which to fit the model and measure."""
+    """Environment steps after which the model is fitted and measured."""
     seeds: int = 1
     """Repetitions."""
     output: Path = Path("results/exploration")
@@ -44,10 +44,10 @@ class Args:
 
 
 def cells(args: Args, run: Run | None = None) -> list[Cell]:
-    """All that is to be done.
+    """The cells to run.
 
     Raises:
-        ValueError: there is no such world or exploration, a world's rules are unknown, or a number is out of range.
+        ValueError: unknown world or exploration, a world without known rules, or a number out of range.
     """
     check_known("exploration", args.explorations, EXPLORATIONS)
     if min(args.seeds, *args.marks) < 1 or list(args.marks) != sorted(set(args.marks)):
@@ -60,12 +60,12 @@ def cells(args: Args, run: Run | None = None) -> list[Cell]:
         if world.missing:
             raise ValueError(f'{world.name} needs pip install "mbagent[{world.missing}]".')
         if exact_world(world) is None:
-            raise ValueError(f"The true rules of {world.name} are not at hand.")
+            raise ValueError(f"The true rules of {world.name} are not available.")
     return [Cell(world, name, seed, args.marks) for world in worlds for name in args.explorations for seed in range(args.seeds)]
 
 
 def execute(args: Args, todo: list[Cell], run: Run) -> None:
-    """Explores, draws coverage and model error, and prints the means."""
+    """Explores, plots coverage and model error, and prints the means."""
     rows = [row for result in run_cells(run_cell, todo, run) for row in result.rows]
     run.write_pictures({"coverage": draw_coverage(rows)})
     show(rows, run)

@@ -1,10 +1,10 @@
-"""Plays environments that are not the agent's own, beside the exact optimum, its planner on the true rules, PPO and DQN.
+"""Compares the agent on environments of other packages with the exact optimum, its planner on the true rules, PPO and DQN.
 
 python scripts/external_benchmark.py                                # quick: one seed, 30 episodes
 python scripts/external_benchmark.py --full                         # 5 seeds, 100 episodes
 python scripts/external_benchmark.py --worlds Taxi SysAdmin --agents mbagent PPO --seeds 2
 
-RDDL domains need pip install "mbagent[rddl]", MiniGrid pip install "mbagent[minigrid]"; without them these are left out.
+RDDL domains need pip install "mbagent[rddl]", MiniGrid pip install "mbagent[minigrid]"; without them these are skipped.
 
 """
 
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 
-# Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
+# Set before NumPy and torch are imported: work is parallel over processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import sys
@@ -26,37 +26,37 @@ from worlds.registry import WORLDS, find_world
 
 @dataclass(frozen=True)
 class Args:
-    """Play environments that are not the agent's own."""
+    """Compare the agent on environments of other packages."""
 
     full: bool = False
     """5 seeds, 100 episodes."""
     worlds: tuple[str, ...] = tuple(world.name for world in WORLDS)
-    """Which environments; "CartPole, binned" and "MountainCar, binned" are the examples of docs/environments.md."""
+    """Environments; "CartPole, binned" and "MountainCar, binned" are the examples of docs/environments.md."""
     agents: tuple[str, ...] = AGENTS
     """Which agents."""
     seeds: int | None = None
     """Repetitions; by default 1, with --full 5."""
     first_seed: int = 0
-    """Seed of the first."""
+    """Seed of the first repetition."""
     episodes: int | None = None
-    """Episodes after each learning; by default 30, with --full 100."""
+    """Episodes after each training; by default 30, with --full 100."""
     steps: int | None = None
     """Environment steps for learning; by default 20,000, FrozenLake 8x8 50,000, Inventory and DeepSea 3,000."""
     baseline_steps: int | None = None
     """Steps for PPO and DQN; by default the same."""
     reward_scale: float | None = None
-    """What rewards are multiplied with where PPO and DQN are trained; by default 1 for PPO and 0.1 for DQN."""
+    """Factor of the rewards in the training of PPO and DQN; by default 1 for PPO and 0.1 for DQN."""
     output: Path = Path("results/external")
-    """Folder for results.csv; results of an earlier run there are moved to a folder of their own inside it."""
+    """Folder for results.csv; results of an earlier run are moved to a subfolder."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Number of processes, each with one thread."""
 
 
 def cells(args: Args, run: Run | None = None) -> list[Cell]:
-    """All that is to be done.
+    """The cells to run.
 
     Raises:
-        ValueError: there is no such world or agent, or a number is out of range.
+        ValueError: unknown world or agent, or a number out of range.
     """
     check_known("agent", args.agents, AGENTS)
     seeds = args.seeds if args.seeds is not None else 5 if args.full else 1
@@ -72,7 +72,7 @@ def cells(args: Args, run: Run | None = None) -> list[Cell]:
     missing = {world.missing for world in worlds if world.missing is not None}
     if run is not None:
         for extra in sorted(missing):
-            run.say(f'Left out what needs pip install "mbagent[{extra}]".')
+            run.say(f'Skipped environments that need pip install "mbagent[{extra}]".')
     return [
         Cell(world, agent, args.first_seed + i, steps, episodes, args.baseline_steps or steps, args.reward_scale)
         for world in worlds
@@ -84,7 +84,7 @@ def cells(args: Args, run: Run | None = None) -> list[Cell]:
 
 
 def execute(args: Args, todo: list[Cell], run: Run) -> None:
-    """Plays, and prints the means."""
+    """Runs the cells and prints the means."""
     rows = [row for result in run_cells(run_cell, todo, run) for row in result.rows]
     if rows:
         show(rows, run)

@@ -1,7 +1,7 @@
-"""Compares forecasts of 1 ... n steps: the one-step model iterated, and a model of its own for each n (paper 4.2).
+"""Compares forecasts of 1 ... n steps: the one-step model iterated, and a separate model for each n (paper 4.2).
 
 python scripts/forecast.py                # quick: n = 1, 2, 4, 8, 15, one seed, 5,000 steps of experience
-python scripts/forecast.py --full         # n = 1 ... 15, 3 seeds, 20,000 steps, and returns of a planner with either kind
+python scripts/forecast.py --full         # n = 1 ... 15, 3 seeds, 20,000 steps, and returns of a planner with both kinds
 
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 
-# Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
+# Set before NumPy and torch are imported: work is parallel over processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import sys
@@ -25,7 +25,7 @@ QUICK_STEPS, FULL_STEPS = (1, 2, 4, 8, 15), tuple(range(1, 16))
 
 @dataclass(frozen=True)
 class Args:
-    """Compare forecasts some steps ahead."""
+    """Compare forecasts several steps ahead."""
 
     full: bool = False
     """Every n from 1 to 15, 3 seeds, 20,000 steps of experience, and the returns of a planner (about 40 minutes)."""
@@ -38,21 +38,21 @@ class Args:
     seeds: int | None = None
     """Repetitions; by default 1, with --full 3."""
     first_seed: int = Settings.first_seed
-    """Seed of the first."""
+    """Seed of the first repetition."""
     n_starts: int = Settings.n_starts
-    """States to forecast from."""
+    """Number of states from which forecasts start."""
     n_draws: int = Settings.n_draws
     """Draws for each."""
     episodes: int | None = None
-    """Episodes that flat Monte Carlo plays with either kind of forecasts; by default 0, with --full 3."""
+    """Episodes that flat Monte Carlo plays with each kind of forecast; by default 0, with --full 3."""
     output: Path = Path("results/forecast")
-    """Folder for the page, the figure and the tables; earlier ones there are moved to a folder of their own inside it."""
+    """Folder for the page, the figure and the tables; earlier ones are moved to a subfolder."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Number of processes, each with one thread."""
 
 
 def settings_of(args: Args, run: Run | None = None) -> Settings:
-    """The settings that the options stand for."""
+    """The settings given by the options."""
 
     def chosen(given: int | None, quick: int, full: int) -> int:
         return given if given is not None else full if args.full else quick

@@ -1,7 +1,7 @@
-"""What all studies share.
+"""Common code of all studies.
 
-A study is a list of cells, each of which becomes rows of tables: ``run_cells`` runs them in parallel processes, keeps the tables
-as csv files and shows how far it is. ``run_command`` is the command line around it: options, refusals of mistakes, the folder.
+A study is a list of cells, each of which yields rows of tables: ``run_cells`` runs them in parallel processes, saves the tables
+as csv files and shows progress. ``run_command`` is the command line: options, error messages, the folder of results.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from rich.text import Text
 from mbagent import files
 
 Row: TypeAlias = dict[str, Any]
-"""A line of a table: names, seeds and figures by column."""
+"""A row of a table: names, seeds and numbers by column."""
 
 Tables: TypeAlias = dict[str, list[Row]]
-"""Rows by name of their table."""
+"""Rows by the name of their table."""
 
 Cell = TypeVar("Cell")
 Outcome = TypeVar("Outcome")
@@ -44,7 +44,7 @@ _HEARTBEAT_SECONDS = 30.0
 
 
 class Options(Protocol):
-    """Options of a command that writes into a folder; ``workers`` is optional."""
+    """Options of a command that writes to a folder; ``workers`` is optional."""
 
     @property
     def output(self) -> Path:
@@ -58,13 +58,13 @@ Plan = TypeVar("Plan")
 
 @dataclass(frozen=True)
 class Result(Generic[Cell]):
-    """What a cell became.
+    """Result of a cell.
 
     Attributes:
-        cell: which.
-        tables: rows by name of their table; all rows of a table have the same columns.
-        label: what is shown when it is done.
-        arrays: what pictures are drawn from and no table holds.
+        cell: the cell.
+        tables: rows by the name of their table; all rows of a table have the same columns.
+        label: text shown when the cell is done.
+        arrays: data for pictures that is not in the tables.
     """
 
     cell: Cell
@@ -83,10 +83,10 @@ class Run:
     """One run of a command.
 
     Attributes:
-        folder: where results go.
+        folder: folder of the results.
         workers: number of processes, each with one thread.
-        console: where progress is shown.
-        command: the command line that makes the same results again.
+        console: console for progress.
+        command: the command line that reproduces the results.
     """
 
     folder: Path
@@ -95,11 +95,11 @@ class Run:
     command: str
 
     def say(self, text: str) -> None:
-        """Shows a line of plain text."""
+        """Prints a line of plain text."""
         self.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def refuse(self, error: Exception) -> None:
-        """Shows why there is nothing to do."""
+        """Prints the reason why the run is refused."""
         self.console.print(f"{error}", style="red", highlight=False, markup=False, soft_wrap=True)
 
     def write(self, tables: Tables) -> None:
@@ -109,7 +109,7 @@ class Run:
                 write_csv(self.folder / f"{name.replace(' ', '_')}.csv", rows)
 
     def write_pictures(self, pictures: Mapping[str, bytes]) -> None:
-        """Writes pictures, PNG by name."""
+        """Writes pictures, given as PNG bytes by name."""
         for name, png in pictures.items():
             files.write(self.folder / f"{name}.png", png)
 
@@ -134,13 +134,13 @@ def run_command(
     """Runs a command line and returns its exit code.
 
     Args:
-        script: name of the file, without its ending.
+        script: name of the file, without its extension.
         description: its docstring, whose first line ``--help`` shows.
         args_type: dataclass of the options.
-        prepare: what is to be done; raises ValueError where there is nothing, with a sentence for the user, or CellsFailedError.
-        execute: does it.
+        prepare: returns the work to do; raises ValueError, with a message for the user, if there is none, or CellsFailedError.
+        execute: does the work.
         argv: the options; None for those of this process.
-        opens: whether the folder is emptied for the run: earlier results there move to a folder of their own inside it.
+        opens: whether the folder is emptied for the run by moving earlier results to a subfolder.
     """
     args = tyro.cli(args_type, args=argv, description=(description or "").splitlines()[0])
     given = sys.argv[1:] if argv is None else argv
@@ -167,18 +167,18 @@ def run_cells(
     order: Callable[[Cell], Any] | None = None,
     each: Callable[[list[Result[Cell]]], None] | None = None,
 ) -> list[Result[Cell]]:
-    """Runs cells in parallel and keeps all tables on disk after each.
+    """Runs cells in parallel and saves all tables after each.
 
     Args:
-        work: runs one cell, in a process of its own.
-        cells: what to run.
-        run: where the tables go.
-        kept: rows of an earlier run, which stay before the new ones.
-        order: what the new rows are sorted by; None for the order in which they are done.
+        work: runs one cell, in a separate process.
+        cells: the cells to run.
+        run: the run whose folder gets the tables.
+        kept: rows of an earlier run, placed before the new ones.
+        order: sort key of the new rows; None for the order of completion.
         each: called after each cell with all results so far.
 
     Returns:
-        The results in the order in which they were done.
+        The results in the order of completion.
     """
     results: list[Result[Cell]] = []
     for result in run_all(work, cells, workers=run.workers, console=run.console, name=lambda result: result.label):
@@ -191,7 +191,7 @@ def run_cells(
 
 
 def joined(results: Iterable[Result[Any]], kept: Tables | None = None) -> Tables:
-    """All rows of all results, table by table, after those ``kept``."""
+    """Rows of all results by table, after those in ``kept``."""
     tables: Tables = {name: list(rows) for name, rows in (kept or {}).items()}
     for result in results:
         for name, rows in result.tables.items():
@@ -202,14 +202,14 @@ def joined(results: Iterable[Result[Any]], kept: Tables | None = None) -> Tables
 def run_all(
     work: Callable[[Cell], Outcome], cells: Iterable[Cell], *, workers: int, console: Console, name: Callable[[Outcome], str]
 ) -> Iterator[Outcome]:
-    """Outcomes in the order in which they are done.
+    """Yields outcomes in the order of completion.
 
     Args:
-        work: does one cell; runs in a process of its own unless ``workers`` is 1.
-        cells: what to do.
+        work: runs one cell, in a separate process unless ``workers`` is 1.
+        cells: the cells to run.
         workers: number of processes.
-        console: a bar in a terminal, a line for each outcome elsewhere.
-        name: what to show of an outcome.
+        console: shows a progress bar in a terminal, otherwise one line per outcome.
+        name: text shown for an outcome.
     """
     todo = list(cells)
     columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
@@ -226,20 +226,20 @@ def run_all(
 
 
 class CellsFailedError(RuntimeError):
-    """Some cells failed; what the others left is kept."""
+    """Some cells failed; the results of the others are saved."""
 
 
 class Recorded(Protocol):
-    """A cell whose outcome is kept in a file of its own."""
+    """A cell whose outcome is saved in a separate file."""
 
     @property
     def name(self) -> str:
-        """What is shown of it."""
+        """Name shown in progress messages."""
         ...
 
     @property
     def file_name(self) -> str:
-        """The file in the folder of records."""
+        """File name in the folder of records."""
         ...
 
 
@@ -248,13 +248,13 @@ Job = TypeVar("Job", bound=Recorded)
 
 @dataclass(frozen=True)
 class Recorder(Generic[Job, Outcome]):
-    """How cells with records are run.
+    """Functions that run cells with records.
 
     Attributes:
-        work: does a cell, and calls its second argument with the share done, 0 ... 1, now and then.
-        write: keeps the outcomes of a cell, all or nothing.
-        read: reads what ``write`` wrote.
-        shown: what is shown of outcomes.
+        work: runs a cell, and regularly calls its second argument with the share done, 0 ... 1.
+        write: saves the outcomes of a cell atomically.
+        read: reads the files of ``write``.
+        shown: summary of the outcomes for progress messages.
     """
 
     work: Callable[[Job, Callable[[float], None]], list[Outcome]]
@@ -274,17 +274,17 @@ class _Done(Generic[Job, Outcome]):
 def run_recorded(
     recorder: Recorder[Job, Outcome], jobs: Sequence[Job], folder: Path, *, workers: int, console: Console
 ) -> list[Outcome]:
-    """Runs all cells that ``folder`` has no records of yet, and returns the outcomes of all.
+    """Runs all cells without records in ``folder``, and returns the outcomes of all cells.
 
     Args:
-        recorder: how.
-        jobs: what to do, the longest first.
-        folder: where each cell's records go as soon as it is done.
+        recorder: functions that run, write and read.
+        jobs: the cells, longest first.
+        folder: folder in which each cell's records are saved as soon as it is done.
         workers: number of processes; 1 runs the cells in this one.
-        console: where progress is shown.
+        console: console for progress.
 
     Raises:
-        CellsFailedError: cells raised; the others were finished first.
+        CellsFailedError: some cells raised an exception; the others were completed first.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for stale in folder.glob("*.progress"):
@@ -314,7 +314,7 @@ def run_recorded(
 
 
 def _record(recorder: Recorder[Job, Outcome], job: Job, folder: Path) -> _Done[Job, Outcome]:
-    """Runs one cell in a worker process; its progress goes through a small file."""
+    """Runs one cell in a worker process, which reports progress through a small file."""
     path = folder / job.file_name
     progress = path.with_suffix(".progress")
     start = time.perf_counter()
@@ -339,7 +339,7 @@ def _record(recorder: Recorder[Job, Outcome], job: Job, folder: Path) -> _Done[J
 
 
 class _Board:
-    """What is going on: a bar over all jobs and one for each running job."""
+    """Progress display: one bar for all jobs and one for each running job."""
 
     def __init__(self, folder: Path, total: int, done: int) -> None:
         self.folder = folder
@@ -351,7 +351,7 @@ class _Board:
         """(share done, name) of each running job."""
         found = []
         for path in sorted(self.folder.glob("*.progress")):
-            with contextlib.suppress(OSError, ValueError):  # it may end, or be half written, just now
+            with contextlib.suppress(OSError, ValueError):  # the file may be deleted or incomplete at this moment
                 share, name = path.read_text(encoding="utf-8").split(" ", 1)
                 found.append((float(share), name))
         return found
@@ -362,7 +362,7 @@ class _Board:
         return "{:d}:{:02d}".format(*divmod(int(time.perf_counter() - self.start), 60))
 
     def render(self) -> Group:
-        """The board for a terminal."""
+        """Renders the board for a terminal."""
         table = Table.grid(padding=(0, 1))
         for share, name in self.running():
             table.add_row("  ", ProgressBar(total=1.0, completed=share, width=24), f"{share:>4.0%}", name)
@@ -374,7 +374,7 @@ class _Board:
 
 @contextlib.contextmanager
 def _shown(board: _Board, console: Console) -> Iterator[None]:
-    """Shows the board live in a terminal, or as a line now and then where there is none."""
+    """Shows the board live in a terminal; without a terminal, prints a line from time to time."""
     if console.is_terminal:
         with Live(get_renderable=board.render, console=console, refresh_per_second=2, transient=True):
             yield
@@ -397,7 +397,7 @@ def _shown(board: _Board, console: Console) -> Iterator[None]:
 
 
 def grouped(rows: Iterable[Row], keys: Sequence[str]) -> dict[tuple[Any, ...], list[Row]]:
-    """Rows by their values in some columns, in the order in which these first occur."""
+    """Groups rows by their values in some columns, in order of first occurrence."""
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         groups.setdefault(tuple(row[key] for key in keys), []).append(row)
@@ -408,17 +408,17 @@ def find(kind: str, name: str, known: Mapping[str, Known]) -> Known:
     """The entry called ``name``.
 
     Raises:
-        ValueError: there is none; the message lists those there are.
+        ValueError: there is none; the message lists the known names.
     """
     check_known(kind, [name], known)
     return known[name]
 
 
 def check_known(kind: str, names: Iterable[str], known: Iterable[str]) -> None:
-    """Refuses names that there are not.
+    """Refuses unknown names.
 
     Raises:
-        ValueError: for the first of them; the message lists those there are, quoted where one has spaces.
+        ValueError: for the first unknown name; the message lists the known ones, quoted if one has spaces.
     """
     listed = list(known)
     for name in names:
@@ -432,10 +432,10 @@ def check_at_least(given: object, **least: int) -> None:
 
     Args:
         given: settings.
-        **least: the least value of each of its attributes named here.
+        **least: smallest allowed value of each named attribute.
 
     Raises:
-        ValueError: one is smaller.
+        ValueError: an attribute is smaller.
     """
     for name, bound in least.items():
         if (value := getattr(given, name)) < bound:
@@ -443,10 +443,10 @@ def check_at_least(given: object, **least: int) -> None:
 
 
 def check_run(folder: Path, workers: int = 1) -> None:
-    """Refuses what no run can begin with.
+    """Refuses options with which no run can start.
 
     Raises:
-        ValueError: the folder of results is a file, or there are no processes to work.
+        ValueError: the folder of results is a file, or the number of processes is below 1.
     """
     if workers < 1:
         raise ValueError(f"--workers must be at least 1 process, got {workers}.")
@@ -455,14 +455,14 @@ def check_run(folder: Path, workers: int = 1) -> None:
 
 
 def open_folder(folder: Path, console: Console) -> None:
-    """Makes a folder ready for a run; says where the results of an earlier one have gone."""
+    """Prepares a folder for a run; prints where results of an earlier run were moved."""
     folder.mkdir(parents=True, exist_ok=True)
     if moved := set_aside(folder):
         console.print(f"Moved earlier results to {moved}.", highlight=False, markup=False, soft_wrap=True)
 
 
 def set_aside(folder: Path) -> Path | None:
-    """Moves the results of an earlier run in ``folder`` to a folder of their own inside it; None where there are none."""
+    """Moves the results of an earlier run in ``folder`` to a subfolder and returns it; None if there are none."""
     old = [path for path in sorted(folder.iterdir()) if path.is_file()]
     if not old:
         return None
@@ -477,7 +477,7 @@ def set_aside(folder: Path) -> Path | None:
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str] | None = None) -> None:
-    """Writes a csv with a line for each row; all rows have the keys ``columns``, or those of the first."""
+    """Writes a csv file with one line per row; all rows have the keys ``columns``, or those of the first row."""
     text = io.StringIO()
     writer = csv.DictWriter(text, columns or list(rows[0]))
     writer.writeheader()

@@ -1,4 +1,4 @@
-"""Kills processes with SIGKILL at random moments while they save, and looks whether the last or the new file loads every time.
+"""Kills processes with SIGKILL at random times while they save, and checks that the last or the new file always loads.
 
 python scripts/kill_test.py --kills 50
 python scripts/kill_test.py --subjects folder --kills 200 --seed 7
@@ -38,7 +38,7 @@ from mbagent.data import TransitionBatch, TransitionDataset
 GAME = "mbagent/FlierCatcher-v0"
 N_FACTORS = 120
 METHOD = "forkserver"
-"""How processes are started: from a server that has imported everything already."""
+"""Start method of processes: forked from a server that has already imported everything."""
 Subject: TypeAlias = Literal["save", "save_transitions", "folder"]
 
 
@@ -47,17 +47,17 @@ class Args:
     """Kill processes that save."""
 
     kills: int = 10
-    """How often to kill each of the subjects, and a fifth as often again through a symbolic link."""
+    """Number of kills per subject, plus a fifth as many through a symbolic link."""
     subjects: tuple[Subject, ...] = ("save", "save_transitions", "folder")
     """What to kill: agent.save, agent.save_transitions, or TransitionDataset(folder=...).append."""
     rows: int = 10_000
-    """Transitions in a file, or in a call of append: the more, the longer a write takes."""
+    """Transitions in a file, or in a call of append: more of them make a write longer."""
     seed: int = 0
-    """Seed of the moments."""
+    """Seed of the times of the kills."""
 
 
 def rows_of(version: int, n: int) -> TransitionBatch:
-    """``n`` transitions that tell which version of a file they are from, and that compress badly."""
+    """``n`` transitions that encode the version of their file, and that compress poorly."""
     rng = np.random.default_rng(version)
     states, after = rng.integers(2, size=(2, n, N_FACTORS), dtype=np.uint8)
     number = np.full(n, version)
@@ -65,10 +65,10 @@ def rows_of(version: int, n: int) -> TransitionBatch:
 
 
 def version_of(rows: TransitionBatch, n: int) -> int:
-    """The version that rows are from.
+    """The version encoded in rows.
 
     Raises:
-        ValueError: they are not those of one version as a whole.
+        ValueError: they are not the complete rows of one version.
     """
     version = int(rows.episodes[0])
     expected = rows_of(version, n)
@@ -78,7 +78,7 @@ def version_of(rows: TransitionBatch, n: int) -> int:
 
 
 def agent_with(version: int, n: int) -> mbagent.ModelLearningAgent:
-    """An agent with the transitions of a version."""
+    """Creates an agent with the transitions of a version."""
     agent = mbagent.ModelLearningAgent("MctsPolicy", gym.make(GAME), seed=0)
     agent.experience.dataset.append(rows_of(version, n))
     agent.num_timesteps = version
@@ -93,7 +93,7 @@ def save_agent(path: Path, version: int, n: int) -> None:
 def load_agent(path: Path, n: int) -> int:
     """The version in a file."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # it is loaded without an environment
+        warnings.simplefilter("ignore", UserWarning)  # loaded without an environment
         agent = mbagent.ModelLearningAgent.load(path)
     version = version_of(agent.experience.dataset.rows(), n)
     if agent.num_timesteps != version:
@@ -112,7 +112,7 @@ def load_transitions(path: Path, n: int) -> int:
 
 
 def append(path: Path, version: int, n: int) -> None:
-    """Appends a version's transitions to a folder; version 0 begins the folder."""
+    """Appends a version's transitions to a folder; version 0 creates the folder."""
     if version:
         TransitionDataset((2,) * N_FACTORS, 3, path).append(rows_of(version, n))
     else:
@@ -120,10 +120,10 @@ def append(path: Path, version: int, n: int) -> None:
 
 
 def load_folder(path: Path, n: int) -> int:
-    """How many versions a folder holds, one after the other."""
+    """Number of versions in a folder, which must be consecutive."""
     rows = TransitionDataset((2,) * N_FACTORS, 3, path).rows()
     if len(rows) % n:
-        raise ValueError(f"{len(rows)} rows are no whole number of versions")
+        raise ValueError(f"{len(rows)} rows are not a whole number of versions")
     last = len(rows) // n
     if last and (version_of(rows.select(slice(-n, None)), n) != last or rows.episodes[::n].tolist() != list(range(1, last + 1))):
         raise ValueError("versions are missing or out of order")
@@ -131,7 +131,7 @@ def load_folder(path: Path, n: int) -> int:
 
 
 class Kind(NamedTuple):
-    """How a subject is written, read, and called."""
+    """Functions that write and read a subject, and its file name."""
 
     write: Callable[[Path, int, int], None]
     read: Callable[[Path, int], int]
@@ -145,29 +145,29 @@ KINDS: dict[Subject, Kind] = {
 }
 
 
-def keep_saving(subject: Subject, path: Path, first: int, n: int, told: Connection, most: int = sys.maxsize) -> None:
-    """Saves one version after the other, and tells of each when it is saved."""
+def keep_saving(subject: Subject, path: Path, first: int, n: int, sender: Connection, most: int = sys.maxsize) -> None:
+    """Saves one version after another, and sends the number of each saved version."""
     for version in itertools.islice(itertools.count(first), most):
         KINDS[subject].write(path, version, n)
-        told.send(version)
+        sender.send(version)
 
 
 def start(subject: Subject, path: Path, first: int, n: int, most: int = sys.maxsize) -> tuple[BaseProcess, Connection]:
-    """A process that saves, and where it tells of what it has saved."""
-    told, tell = multiprocessing.Pipe(duplex=False)
+    """Starts a process that saves; returns it and the connection that receives the saved versions."""
+    receiver, sender = multiprocessing.Pipe(duplex=False)
     context: Any = multiprocessing.get_context(METHOD)
-    process = context.Process(target=keep_saving, args=(subject, path, first, n, tell, most))
+    process = context.Process(target=keep_saving, args=(subject, path, first, n, sender, most))
     process.start()
-    tell.close()
-    return process, told
+    sender.close()
+    return process, receiver
 
 
-def last_told(told: Connection) -> int | None:
-    """The last version a process told of; waits for none."""
+def last_received(receiver: Connection) -> int | None:
+    """The last version received so far, without waiting."""
     version = None
     try:
-        while told.poll():
-            version = int(told.recv())
+        while receiver.poll():
+            version = int(receiver.recv())
     except EOFError:
         pass
     return version
@@ -179,17 +179,17 @@ def leftovers(path: Path) -> list[Path]:
 
 
 def kill_once(subject: Subject, path: Path, last: int, n: int, wait: Callable[[], None]) -> tuple[int, bool]:
-    """Kills a process that saves, some time after its first save; returns the version found, and whether it was cut short.
+    """Kills a process that saves after its first save; returns the version found, and whether a write was interrupted.
 
     Raises:
-        Exception: what was found is neither the last version nor the next.
+        Exception: the file contains neither the last version nor the next.
     """
-    process, told = start(subject, path, last + 1, n)
-    saved = int(told.recv())
+    process, receiver = start(subject, path, last + 1, n)
+    saved = int(receiver.recv())
     wait()
     process.kill()
     process.join()
-    saved = last_told(told) or saved
+    saved = last_received(receiver) or saved
     found = KINDS[subject].read(path, n)
     if found not in (saved, saved + 1):
         raise ValueError(f"version {found} was found after version {saved} had been saved")
@@ -197,12 +197,12 @@ def kill_once(subject: Subject, path: Path, last: int, n: int, wait: Callable[[]
     return found, longer or bool(leftovers(path))
 
 
-def wait_for_write(path: Path, most: float, then: float) -> None:
-    """Waits until there is a temporary file, at most ``most`` seconds, and ``then`` seconds more."""
+def wait_for_write(path: Path, most: float, delay: float) -> None:
+    """Waits until there is a temporary file, at most ``most`` seconds, and then another ``delay`` seconds."""
     until = time.perf_counter() + most
     while time.perf_counter() < until and not leftovers(path):
         time.sleep(0.0005)
-    time.sleep(then)
+    time.sleep(delay)
 
 
 def kill(subject: Subject, path: Path, kills: int, args: Args, console: Console) -> int:
@@ -214,12 +214,12 @@ def kill(subject: Subject, path: Path, kills: int, args: Args, console: Console)
     seconds = time.perf_counter() - began
     for i in track(range(kills), subject, console=console, disable=not console.is_terminal):
         wait = partial(time.sleep, rng.uniform(0, 1.5 * seconds))
-        if i % 2:  # every second kill comes when the file is being written, which may be a small part of a save
+        if i % 2:  # every second kill is timed to the writing of the file, which may be a small part of a save
             wait = partial(wait_for_write, path, 1.5 * seconds, rng.uniform(0, 0.02))
         try:
-            last, short = kill_once(subject, path, last, args.rows, wait)
-            cut += short
-        except Exception as error:  # whatever it is, something was lost
+            last, interrupted = kill_once(subject, path, last, args.rows, wait)
+            cut += interrupted
+        except Exception as error:  # any error means a loss
             say(console, f"lost: {error!r}", "red")
             lost += 1
             remove(path.resolve())
@@ -230,13 +230,13 @@ def kill(subject: Subject, path: Path, kills: int, args: Args, console: Console)
     if kind.read(path, args.rows) != last + 1 or left or path.is_symlink() != linked:
         say(console, f"after one more save there is {left or 'another version'}, or the link is gone", "red")
         lost += 1
-    told = f"{subject}{' through a link' * linked}: {kills} kills, {cut} of them in the middle of a write, {seconds:.2f} s a save"
-    say(console, f"{told}: {lost} losses", "red" if lost else None)
+    summary = f"{subject}{' through a link' * linked}: {kills} kills, {cut} of them during a write, {seconds:.2f} s per save"
+    say(console, f"{summary}: {lost} losses", "red" if lost else None)
     return lost
 
 
 def say(console: Console, text: str, style: str | None = None) -> None:
-    """Prints a line as it is."""
+    """Prints a line without markup."""
     console.print(text, style=style, highlight=False, markup=False, soft_wrap=True)
 
 
@@ -258,12 +258,12 @@ def write_together(subject: Subject, folder: Path, args: Args, console: Console)
             if not any(first <= found < first + args.kills for first in begins) and found != 0:
                 raise ValueError(f"version {found} was never saved")
             loads += 1
-        except Exception as error:  # whatever it is, a reader failed
+        except Exception as error:  # any error means that a reader failed
             say(console, f"failed: {error!r}", "red")
             failures += 1
     failures += sum(process.exitcode != 0 for process, _ in writers) + len(leftovers(path))
-    told = f"{subject}: two processes with {args.kills} saves each at one path, loaded {loads} times meanwhile"
-    say(console, f"{told}: {failures} failures", "red" if failures else None)
+    summary = f"{subject}: two processes with {args.kills} saves each at one path, loaded {loads} times meanwhile"
+    say(console, f"{summary}: {failures} failures", "red" if failures else None)
     return failures
 
 
@@ -287,7 +287,7 @@ def main(argv: list[str] | None = None) -> int:
             link.symlink_to(own / "target" / link.name, target_is_directory=subject == "folder")
             lost += kill(subject, own / "plain" / link.name, args.kills, args, console)
             lost += kill(subject, link, max(1, args.kills // 5), args, console)
-            if subject != "folder":  # a folder tells the second of two that the first has written
+            if subject != "folder":  # a folder dataset refuses a second writer
                 lost += write_together(subject, own, args, console)
     say(console, f"{lost} losses." if lost else "Nothing was lost.", "red" if lost else "green")
     return 1 if lost else 0

@@ -1,4 +1,4 @@
-"""Draws the return of the agent, PPO and DQN against environment steps.
+"""Plots the return of the agent, PPO and DQN against environment steps.
 
 python scripts/learning_curves.py                                   # quick: Breakout, 5,000 steps
 python scripts/learning_curves.py --full                            # Breakout and Asterix, up to 100,000 steps
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 
-# Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
+# Set before NumPy and torch are imported: work is parallel over processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import sys
@@ -30,15 +30,15 @@ class Args:
     """Learning curves."""
 
     full: bool = False
-    """Breakout and Asterix, up to 100,000 steps, 20 episodes each time (an hour or more)."""
+    """Breakout and Asterix, up to 100,000 steps, 20 episodes per mark (an hour or more)."""
     worlds: tuple[str, ...] | None = None
-    """Which environments, by the names of scripts/external_benchmark.py, "MinAtar Breakout" and "MinAtar Asterix"."""
+    """Environments, by the names of scripts/external_benchmark.py, "MinAtar Breakout" and "MinAtar Asterix"."""
     agents: tuple[str, ...] = PLAYERS
     """Which agents."""
     marks: tuple[int, ...] | None = None
-    """Environment steps after which to play."""
+    """Environment steps after which episodes are played."""
     episodes: int | None = None
-    """Episodes each time; by default 5, with --full 20."""
+    """Episodes per mark; by default 5, with --full 20."""
     seeds: int = 1
     """Repetitions."""
     output: Path = Path("results/curves")
@@ -48,10 +48,10 @@ class Args:
 
 
 def cells(args: Args, run: Run | None = None) -> list[Cell]:
-    """All that is to be done.
+    """The cells to run.
 
     Raises:
-        ValueError: there is no such world or agent, a world needs an extra, or a number is out of range.
+        ValueError: unknown world or agent, a world that needs an extra, or a number out of range.
     """
     check_known("agent", args.agents, PLAYERS)
     marks = args.marks or (FULL if args.full else QUICK)
@@ -67,7 +67,7 @@ def cells(args: Args, run: Run | None = None) -> list[Cell]:
 
 
 def execute(args: Args, todo: list[Cell], run: Run) -> None:
-    """Learns and plays, draws the curves and prints the means."""
+    """Learns and plays, plots the curves and prints the means."""
     rows = [row for result in run_cells(run_cell, todo, run) for row in result.rows]
     run.write_pictures({"curves": draw_curves(rows)})
     show(rows, run)

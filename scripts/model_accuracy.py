@@ -1,4 +1,4 @@
-"""Measures how exactly models predict next states from layouts that they have not seen.
+"""Measures how accurately models predict next states on unseen layouts.
 
 python scripts/model_accuracy.py                          # quick: one seed, 2,000 and 5,000 steps, 20,000 tests
 python scripts/model_accuracy.py --full                   # 5 seeds, 2,000, 5,000 and 20,000 steps, 100,000 tests
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 
-# Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
+# Set before NumPy and torch are imported: work is parallel over processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import sys
@@ -29,33 +29,33 @@ Plan: TypeAlias = tuple[list[Cell], list[Question]]
 
 @dataclass(frozen=True)
 class Args:
-    """Measure how exactly models predict."""
+    """Measure how accurately models predict."""
 
     full: bool = False
     """5 seeds, up to 20,000 steps, 100,000 tests."""
     cases: tuple[str, ...] = tuple(case.name for case in CASES)
     """Which worlds."""
     models: tuple[str, ...] = ("graphs", "networks")
-    """Which models: any by name, and bayesnet, a dynamic Bayesian network by pyAgrum (pip install "mbagent[yardsticks]")."""
+    """Models: any by name, and bayesnet, a dynamic Bayesian network by pyAgrum (pip install "mbagent[yardsticks]")."""
     steps: tuple[int, ...] | None = None
     """Steps of random play to learn from; by default 2,000 and 5,000, with --full 20,000 too."""
     seeds: int | None = None
     """Repetitions; by default 1, with --full 5."""
     first_seed: int = Settings.first_seed
-    """Seed of the first."""
+    """Seed of the first repetition."""
     n_tests: int | None = None
-    """Transitions to test on; by default 20,000, with --full 100,000."""
+    """Test transitions; by default 20,000, with --full 100,000."""
     output: Path = Path("results/model_accuracy")
-    """Folder for results.csv; results of an earlier run there are moved to a folder of their own inside it."""
+    """Folder for results.csv; results of an earlier run are moved to a subfolder."""
     studies: tuple[str, ...] = tuple(name for name in STUDIES if name != "minatar")
-    """Further questions: changes of rules, false alarms of such changes, transfer between sizes, cost, parents found, error
-    estimates (trust), planning (agents); minatar needs pip install "mbagent[minatar]". None with --studies alone."""
+    """Further studies: changes of rules, false alarms of such changes, transfer between sizes, cost, parents found, error
+    estimates (trust), planning (agents); minatar needs pip install "mbagent[minatar]". None after --studies without values."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Number of processes, each with one thread."""
 
 
 def plan(args: Args, run: Run | None = None) -> Plan:
-    """What is to be measured, and the further questions.
+    """The settings of the measurement, and the further studies.
 
     Raises:
         ValueError: an option is out of range.
@@ -89,7 +89,7 @@ def show(scores: list[Row], run: Run) -> None:
 
 
 def execute(args: Args, plan: Plan, run: Run) -> None:
-    """Measures, asks, and writes the page."""
+    """Measures, runs the further studies, and writes the page."""
     todo, further = plan
     scores = [row for result in run_cells(run_cell, todo, run) for row in result.rows]
     if scores:

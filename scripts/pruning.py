@@ -1,4 +1,4 @@
-"""Prunes learned networks to one share after another and shows what is left (the paper's section 5).
+"""Prunes learned networks to increasing shares and measures the results (the paper's section 5).
 
 python scripts/pruning.py                    # quick: FlierCatcher, one seed
 python scripts/pruning.py --full             # three games, 5 seeds, 100 episodes each
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 
-# Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
+# Set before NumPy and torch are imported: work is parallel over processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import sys
@@ -27,18 +27,18 @@ SIZES = (16, 32, 64, 128)
 
 @dataclass(frozen=True)
 class Args:
-    """Prune networks and measure what is left."""
+    """Prune networks and measure the results."""
 
     full: bool = False
     """FlierCatcher, GeyserRunner and Maneuverer, 5 seeds and 100 episodes each."""
     games: tuple[str, ...] | None = None
-    """Which games; by default flier_catcher, with --full geyser_high_cost and maneuverer, too."""
+    """Games; by default flier_catcher, with --full also geyser_high_cost and maneuverer."""
     fractions: tuple[float, ...] = FRACTIONS
     """Shares of the connections to remove."""
     ways: tuple[Way, ...] = Settings.ways
-    """Just the smallest weights, or also what the transitions do not call for."""
+    """Remove only the smallest weights, or also those that the transitions do not support."""
     sizes: tuple[int, ...] | None = None
-    """Numbers of variables to time worlds of; by default none, with --full 16, 32, 64 and 128."""
+    """Numbers of variables of environments for timing; by default none, with --full 16, 32, 64 and 128."""
     networks: Networks = "causal"
     """The default networks, or the paper's own (much slower), both on flat variables."""
     timesteps: int = Settings.timesteps
@@ -46,17 +46,17 @@ class Args:
     seeds: int | None = None
     """Repetitions; by default 1, with --full 5."""
     first_seed: int = Settings.first_seed
-    """Seed of the first."""
+    """Seed of the first repetition."""
     episodes: int | None = None
-    """Episodes that each agent plays; by default 10, with --full 100; 0 for none."""
+    """Episodes for each agent; by default 10, with --full 100; 0 for none."""
     output: Path = Path("results/pruning")
-    """Folder for the page, the figures and the table; earlier ones there are moved to a folder of their own inside it."""
+    """Folder for the page, the figures and the table; earlier ones are moved to a subfolder."""
     workers: int = 1
-    """Number of processes, each with one thread; speeds are measured best with one."""
+    """Number of processes, each with one thread; speeds are most reliable with one."""
 
 
 def settings_of(args: Args, run: Run | None = None) -> Settings:
-    """The settings that the options stand for."""
+    """The settings given by the options."""
     return Settings(
         games=args.games if args.games is not None else GAMES if args.full else GAMES[:1],
         fractions=tuple(sorted(set(args.fractions))),
@@ -70,7 +70,7 @@ def settings_of(args: Args, run: Run | None = None) -> Settings:
 
 
 def execute(args: Args, settings: Settings, run: Run) -> None:
-    """Prunes and measures; the page is written anew after each cell."""
+    """Prunes and measures; the page is rewritten after each cell."""
     sizes = args.sizes if args.sizes is not None else SIZES if args.full else ()
     costs = [measure_size(d, settings.first_seed + i) for d in sizes for i in range(min(settings.seeds, 3))]
     run.write({"sizes": [row._asdict() for row in costs]})

@@ -1,4 +1,4 @@
-"""Writes the tables of results that the README shows, from what a comparison, the sampling accuracy and pruning have written.
+"""Writes the README's tables of results from the files of the comparison, sampling accuracy and pruning studies.
 
 python scripts/results_table.py --results results/compare/results.csv --accuracy results/sampling_accuracy/results.csv
 """
@@ -32,20 +32,20 @@ BASELINES = ("PPO", "DQN", "A2C")
 
 @dataclass(frozen=True)
 class Args:
-    """Write the README's tables of results; a table whose file does not exist stays as it is."""
+    """Write the README's tables of results; a table whose file does not exist is not changed."""
 
     results: Path = Path("results/compare/results.csv")
-    """What a comparison wrote."""
+    """Results of scripts/compare_agents.py."""
     accuracy: Path = Path("results/sampling_accuracy/results.csv")
-    """What scripts/sampling_accuracy.py wrote."""
+    """Results of scripts/sampling_accuracy.py."""
     pruning: tuple[Path, ...] = (Path("results/pruning/summary.csv"),)
-    """What scripts/pruning.py wrote, one file or more."""
+    """Results of scripts/pruning.py, in one or more files."""
     external: tuple[Path, ...] = (Path("results/external/results.csv"),)
-    """What scripts/external_benchmark.py wrote; of several files the last one that has a world and an agent counts."""
+    """Results of scripts/external_benchmark.py; the last file with a world and an agent is used for them."""
     baselines: Path | None = None
-    """Where the baselines' rows are, if in another file."""
+    """File with the baselines' rows, if separate."""
     readme: Path = Path("README.md")
-    """The tables go between the marks <!-- results -->, <!-- accuracy --> and <!-- pruning --> in this file."""
+    """File in which the tables are placed between the marks <!-- results -->, <!-- accuracy --> and <!-- pruning -->."""
     environments: Path = Path("docs/environments.md")
     """Likewise <!-- external -->."""
 
@@ -54,7 +54,7 @@ Scores = dict[tuple[str, str, str], list[float]]
 
 
 def read(path: Path) -> Scores:
-    """Normalised return of each training by (case, agent, goal); points of learning curves and longer trainings left out."""
+    """Normalised return of each training by (case, agent, goal), without points of learning curves and longer trainings."""
     scores: Scores = defaultdict(list)
     steps: dict[tuple[str, str, str], int] = {}
     with path.open(encoding="utf-8") as file:
@@ -72,7 +72,7 @@ def score(values: Sequence[float]) -> str:
 
 
 def new_goals(scores: Scores, case: str) -> str:
-    """The lowest share, over the new goals of a case, of the true model's mean score that the learned model reaches."""
+    """Mean score of the learned model as a share of the true model's; the lowest over the new goals of a case."""
     goals = {goal for found, agent, goal in scores if found == case and agent == TRUE_MODEL and goal != "default"}
     shares = [statistics.fmean(scores[case, AGENT, goal]) / statistics.fmean(scores[case, TRUE_MODEL, goal]) for goal in goals]
     return f"{min(shares):.2f}" if shares else "–"
@@ -90,7 +90,7 @@ def table(scores: Scores, others: Scores) -> str:
 
 
 def _fill(document: Path, tables: Mapping[str, str]) -> None:
-    """Puts each table between its marks."""
+    """Replaces the text between the marks of each table."""
     text = document.read_text(encoding="utf-8")
     for name, filled in tables.items():
         mark = f"<!-- {name} -->"
@@ -99,7 +99,7 @@ def _fill(document: Path, tables: Mapping[str, str]) -> None:
 
 
 def main(args: Args) -> None:
-    """Writes the tables into the documents."""
+    """Writes the tables to the documents."""
     tables = {}
     if args.results.exists():
         scores = read(args.results)

@@ -1,4 +1,4 @@
-"""Measures how accurately models sample transition probabilities (the paper's section 3.3), beside the paper's figures.
+"""Measures how accurately models sample transition probabilities (the paper's section 3.3), compared with the paper's results.
 
 python scripts/sampling_accuracy.py                         # quick: 3 data sets a trial, without the largest trial
 python scripts/sampling_accuracy.py --full                  # 20 data sets a trial, 60 of the tiniest, 5 of the largest
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 
-# Before NumPy and torch are imported: parallel work is done by processes, each with one thread.
+# Set before NumPy and torch are imported: work is parallel over processes, each with one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import sys
@@ -44,36 +44,36 @@ class Args:
     full: bool = False
     """All trials with 20 data sets each, 60 of the tiniest, 5 of the largest (about an hour)."""
     trials: tuple[str, ...] | None = None
-    """Which of 1a, 1b, 2a, 2b, 2c, 3; by default all but 3, with --full all."""
+    """Trials among 1a, 1b, 2a, 2b, 2c, 3; by default all but 3, with --full all."""
     parts: tuple[Part, ...] | None = None
-    """Every sampler in every trial; the combined sampler with one thing changed at a time; growing numbers of variables.
+    """Every sampler in every trial; variants of the combined sampler, with one change each; growing numbers of variables.
     By default the first, with --full all."""
     seeds: int | None = None
     """Data sets for each trial, at most 20 (60 of the tiniest, 5 of the largest); by default 3, with --full all."""
     first_seed: int = FIRST_SCORED_SEED
-    """Number of the first data set; those below 1000 are for choosing settings."""
+    """Number of the first data set; those below 1000 are reserved for choosing settings."""
     n_draws: int = 1000
-    """Draws for each input."""
+    """Samples per input."""
     relates: Literal["previous", "input"] = "previous"
-    """What a variable copies: the output variable set before it, or the same variable of the input."""
+    """Source from which a variable copies: the output variable set before it, or the same variable of the input."""
     shuffle: Literal["output", "input"] = "output"
-    """Whether the order of variables is drawn anew for every output or once for every input."""
+    """Whether the order of variables is drawn for every output or once for every input."""
     multiplier: float = 1.0
-    """The paper's b: share of the d^2 inputs that is used."""
+    """The paper's b: share of the d^2 inputs that are used."""
     fit: FitOptions = field(default_factory=FitOptions)
-    """How the paper's networks are fitted."""
+    """Options for fitting the paper's networks."""
     output: Path = Path("results/sampling_accuracy")
     """Folder for the page and results.csv; results of an earlier run there are moved to a folder of their own inside it."""
     resume: bool = False
-    """Keep the data sets that the folder already has; they must have been measured with the same options."""
+    """Keep the results that are already in the folder; they must have been measured with the same options."""
     report_only: bool = False
-    """Only write the page again, from what an earlier run left in the folder."""
+    """Only rewrite the page, from the results of an earlier run in the folder."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Number of processes, each with one thread."""
 
 
 def settings_of(args: Args) -> Settings:
-    """The settings that the options stand for."""
+    """The settings given by the options."""
     trials = args.trials if args.trials is not None else tuple(t.name for t in TRIALS) if args.full else QUICK_TRIALS
     seeds = args.seeds if args.seeds is not None or args.full else 3
     parts: tuple[Part, ...] = args.parts if args.parts is not None else get_args(Part) if args.full else ("samplers",)
@@ -81,13 +81,13 @@ def settings_of(args: Args) -> Settings:
 
 
 class Plan(NamedTuple):
-    """What is left to be done, and what an earlier run has left.
+    """The work to do, and the results of an earlier run.
 
     Attributes:
-        settings: those that all figures have.
-        todo: cells that are not done.
+        settings: settings shared by all results.
+        todo: cells that are still to be run.
         kept: rows of an earlier run.
-        points: pairs of an earlier run.
+        points: pairs (observed, inferred) of an earlier run.
     """
 
     settings: Settings
@@ -97,10 +97,10 @@ class Plan(NamedTuple):
 
 
 def prepare(args: Args, run: Run) -> Plan:
-    """Makes the folder ready for a run, or for what is left of one.
+    """Prepares the folder for a new or continued run.
 
     Raises:
-        ValueError: there is nothing to go on with, or it was measured with other options.
+        ValueError: there are no results to continue from, or they were measured with other options.
     """
     settings, noted = settings_of(args), args.output / "settings.json"
     if args.report_only:
@@ -123,7 +123,7 @@ def prepare(args: Args, run: Run) -> Plan:
 
 
 def execute(args: Args, plan: Plan, run: Run) -> None:
-    """Measures what is not done, saving after each cell, and writes the page."""
+    """Runs the remaining cells, saving after each, and writes the page."""
 
     def save(results: list[Result[Cell]]) -> None:
         if results[-1].cell.part == "samplers":

@@ -1,1 +1,1 @@
-"""Compares agents on any environment: returns of whole episodes, baselines, intervals, and a page that shows them."""
+"""Comparison of agents on any environment: returns of whole episodes, baselines, confidence intervals and a results page."""

@@ -1,4 +1,4 @@
-"""PPO, DQN and A2C of Stable-Baselines3, with settings that suit short runs on small games."""
+"""PPO, DQN and A2C of Stable-Baselines3, with settings for short runs on small games."""
 
 from __future__ import annotations
 
@@ -34,26 +34,26 @@ BASELINE_SETTINGS: Mapping[str, Mapping[str, Any]] = {
     },
     "A2C": {"n_envs": 8, "n_steps": 5, "learning_rate": 1e-3, "ent_coef": 0.01, "use_rms_prop": False},
 }
-"""What differs from SB3's defaults, and the number of environment copies; "MlpPolicy" (two layers of 64)
-everywhere.
+"""Settings that differ from SB3's defaults, and the number of environment copies; all use "MlpPolicy" (two
+layers of 64).
 
-DQN's loss grows only linearly with large errors, so that rare high costs count too little: it seeks medians
-rather than means. Rewards scaled down keep the errors where the loss is quadratic.
-The copies and the lengths of their roll-outs divide 10,000, so that exactly the steps asked for are used.
+DQN's Huber loss is linear for large errors, so rare high costs have too little effect: it estimates medians
+rather than means. Scaled-down rewards keep the errors in the quadratic range of the loss.
+The number of copies times the length of their rollouts divides 10,000, so exactly the requested steps are used.
 """
 
 _CLASSES: dict[str, type[BaseAlgorithm]] = {"PPO": PPO, "DQN": DQN, "A2C": A2C}
 Curve = list[tuple[int, float]]
 Evaluate = Callable[[Policy, bool], float]
-"""(policy, whether equal observations always get equal actions) -> mean return."""
+"""(policy, whether it is deterministic) -> mean return."""
 
 
 def as_policy(algorithm: Any, *, deterministic: bool = True) -> Policy:
-    """The policy of anything with SB3's ``predict``.
+    """Policy of an object with SB3's ``predict``.
 
     Args:
         algorithm: an SB3 algorithm, or the agent of this package.
-        deterministic: the most likely action; else sampled as in training.
+        deterministic: take the most likely action; else sample as in training.
     """
 
     def policy(obs: Any) -> NDArray[np.int64]:
@@ -66,8 +66,8 @@ def as_policy(algorithm: Any, *, deterministic: bool = True) -> Policy:
 def best_mode(algorithm: Any, evaluate: Evaluate) -> tuple[bool, float]:
     """Whether an algorithm scores better with its most likely actions or with sampled ones, and that score.
 
-    A policy whose most likely action runs against a wall forever does better when it samples; the baselines
-    are given the benefit of either.
+    A policy whose most likely action runs against a wall forever does better with sampled actions; each
+    baseline is scored in its better mode.
     """
     likely = evaluate(as_policy(algorithm, deterministic=True), True)
     sampled = evaluate(as_policy(algorithm, deterministic=False), False)
@@ -111,14 +111,14 @@ def train_baseline(
     """Trains one baseline.
 
     Args:
-        name: which algorithm.
-        make_env: makes one environment.
+        name: the algorithm.
+        make_env: creates one environment.
         steps: environment steps over all copies together.
         seed: seed of networks, exploration and environments.
-        evaluate: mean return of a policy (and whether it is deterministic), for the learning curve.
-        points: evaluations on the learning curve, besides the one before training.
-        reward_scale: what rewards are multiplied with for training; None for what BASELINE_SETTINGS say.
-        report: told the share of steps done, 0 ... 1.
+        evaluate: returns the mean return of (policy, whether it is deterministic), for the learning curve.
+        points: evaluations on the learning curve, in addition to the one before training.
+        reward_scale: factor of the rewards in training; None for that of BASELINE_SETTINGS.
+        report: called with the share of steps done, 0 ... 1.
 
     Returns:
         (the trained algorithm, learning curve as (environment steps, mean return)).
@@ -131,7 +131,7 @@ def train_baseline(
         return TransformReward(make_env(), lambda reward: scale * float(reward))
 
     vec_env = make_vec_env(make_scaled, n_envs=settings.pop("n_envs"), seed=seed)
-    # The learning rates were chosen for 50,000 steps; much longer runs keep them.
+    # The learning rates were chosen for 50,000 steps; they are not adapted to longer runs.
     algorithm = _CLASSES[name]("MlpPolicy", vec_env, seed=seed, device="cpu", verbose=0, **settings)
     callback = _Checkpoints(steps, points, evaluate, report)
     algorithm.learn(total_timesteps=steps, callback=callback)

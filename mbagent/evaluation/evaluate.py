@@ -1,8 +1,8 @@
-"""Plays whole episodes of any policy in one batch and scores them, for every goal at once if asked.
+"""Plays whole episodes of any policy in one batch and scores them, for several goals at once on request.
 
-Episodes for reporting are numbered apart from everything an agent trained on: they start from keys of their
-own. The same seed gives every policy the same start states and the same luck, so that differences are the
-policies'.
+Evaluation episodes never coincide with training episodes: their random keys are derived from a separate salt.
+With the same seed, every policy gets the same start states and random numbers, so that differences in returns
+are due to the policies.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Policy = Callable[[Any], NDArray[np.int64]]
 Goal = Callable[[Any, Any, Any], NDArray[Any]]
 """Reward function (obs, action, next_obs) -> floats [B]."""
 
-_REPORTING = 0x5EED  # salt that keeps the episodes for reporting apart from training
+_REPORTING = 0x5EED  # salt that separates evaluation episodes from training episodes
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class Evaluation:
 
     Attributes:
         returns: undiscounted return of each episode, float64 [episodes], by name of the goal.
-        seconds: wall time spent inside the policy.
-        decisions: number of decisions the policy took.
+        seconds: wall time spent in the policy.
+        decisions: number of decisions of the policy.
     """
 
     returns: Mapping[str, NDArray[np.float64]]
@@ -51,7 +51,7 @@ class Evaluation:
 
 @dataclass
 class _Stopwatch:
-    """A policy that is timed, and is asked only once about equal observations if it is ``repeatable``."""
+    """Times a policy, and calls it only once for equal observations if it is ``repeatable``."""
 
     policy: Policy
     repeatable: bool
@@ -87,18 +87,18 @@ def evaluate_game(
     repeatable: bool = False,
     report: Callable[[float], None] | None = None,
 ) -> Evaluation:
-    """Plays ``episodes`` episodes of a game side by side.
+    """Plays ``episodes`` episodes of a game in parallel.
 
     Args:
         game: the game; its ``max_episode_steps`` ends an episode.
-        policy: what acts.
-        episodes: how many.
-        seed: which episodes.
-        goals: reward functions to score the episodes with, by name; None for the game's own, called
+        policy: chooses the actions.
+        episodes: number of episodes.
+        seed: seed of start states and random numbers.
+        goals: reward functions by name with which the episodes are scored; None for the game's own, named
             "default".
-        repeatable: whether equal observations always get equal actions, so that the policy is asked only
-            once.
-        report: told the share done, 0 ... 1, after every step.
+        repeatable: whether equal observations always get equal actions, so that the policy is called only
+            once for them.
+        report: called with the share done, 0 ... 1, after every step.
     """
     goals = {"default": game.reward} if goals is None else goals
     keys = derive(derive(seed, _REPORTING), np.arange(episodes))
@@ -109,7 +109,7 @@ def evaluate_game(
     for step in range(game.max_episode_steps):
         actions = watch(obs)
         next_obs = game.transition(obs, actions, derive(keys, step + 1))
-        # Integers wide enough that a user's sums over planes do not overflow int8.
+        # Wide integers, so that sums over planes in a user's reward function do not overflow int8.
         wide, wide_next = obs.astype(np.int64), next_obs.astype(np.int64)
         for name, goal in goals.items():
             returns[name] += np.where(running, np.asarray(goal(wide, actions, wide_next), dtype=np.float64), 0.0)
@@ -130,17 +130,17 @@ def evaluate_env(
     seed: int = 0,
     repeatable: bool = False,
 ) -> Evaluation:
-    """Plays one episode in each of ``episodes`` copies of an environment, deciding for all at once.
+    """Plays one episode in each of ``episodes`` copies of an environment, with one batch of decisions per step.
 
     Args:
-        make_env: makes a copy; it has to end its episodes by itself.
-        policy: what acts; observations come laid out as ``gymnasium.vector.utils.batch_space`` does.
-        episodes: how many.
-        seed: which episodes.
-        repeatable: see ``evaluate_game``; observations have to be plain arrays for it.
+        make_env: creates a copy, whose episodes must end by themselves.
+        policy: chooses the actions; observations are batched as in ``gymnasium.vector.utils.batch_space``.
+        episodes: number of episodes.
+        seed: seed of the environments.
+        repeatable: see ``evaluate_game``; requires observations that are plain arrays.
     """
     envs = [make_env() for _ in range(episodes)]
-    # np.random.SeedSequence keeps the seeds of reporting away from the small numbers used for training.
+    # np.random.SeedSequence separates the evaluation seeds from the small numbers used for training.
     seeds = np.random.SeedSequence([seed, _REPORTING]).generate_state(episodes)
     watch = _Stopwatch(policy, repeatable)
     returns = np.zeros(episodes)
@@ -161,24 +161,24 @@ def evaluate_env(
 
 
 def _stack(space: gym.Space[Any], observations: Sequence[Any]) -> Any:
-    """One batch of many observations."""
+    """Stacks observations into one batch."""
     empty: Any = create_empty_array(space, len(observations))
     return concatenate(space, observations, empty)
 
 
 def random_policy(n_actions: int, seed: int = 0) -> Policy:
-    """Uniformly random actions from a generator of its own."""
+    """Policy of uniformly random actions, with its own generator."""
     rng = np.random.default_rng(seed)
     return lambda obs: rng.integers(n_actions, size=len(obs))
 
 
 def milliseconds_per_decision(policy: Policy, observations: NDArray[Any], *, warm_up: int = 3) -> float:
-    """Median wall time of a decision about a single observation, in milliseconds.
+    """Median wall time of a decision for a single observation, in milliseconds.
 
     Args:
-        policy: what is timed.
-        observations: observations [N, ...], each decided on its own.
-        warm_up: decisions made before the clock starts (compilation, caches).
+        policy: the policy to time.
+        observations: observations [N, ...]; each is a batch of its own.
+        warm_up: decisions before timing starts (compilation, caches).
     """
     for row in range(min(warm_up, len(observations))):
         policy(observations[row : row + 1])

@@ -1,4 +1,4 @@
-"""Figures of lines, one panel beside another, that look alike on every page."""
+"""Line plots in panels, in a style shared by all pages."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FIGURE_STYLE: Any = {
     "ytick.color": "#4a5361",
     "svg.hashsalt": "mbagent",
 }
-"""Settings for ``matplotlib.rc_context``: every figure of every page looks alike."""
+"""Settings for ``matplotlib.rc_context``, shared by the figures of all pages."""
 
 
 _PLACES: Any = {"above": "outside upper center", "below": "outside lower center"}
@@ -37,13 +37,13 @@ class Line:
     """One line of a panel.
 
     Attributes:
-        x: numbers [N]; nothing for a level across the whole panel.
-        y: numbers [N], or the level alone.
-        colour: of the line.
-        label: what the legend calls it; lines of equal labels share an entry, and "" has none.
-        error: half-lengths of error bars [N], where there are any.
-        band: lower and upper ends [N] of a shaded band, where there is one.
-        marker: of its points.
+        x: numbers [N]; empty for a horizontal line across the whole panel.
+        y: numbers [N]; a single one for a horizontal line.
+        colour: colour of the line.
+        label: its name in the legend; lines with equal labels share an entry, and "" has none.
+        error: half-lengths of error bars [N], or None.
+        band: lower and upper ends [N] of a shaded band, or None.
+        marker: marker of the points.
         style: solid, or "--", ":".
     """
 
@@ -62,12 +62,12 @@ class Panel:
     """One pair of axes.
 
     Attributes:
-        title: above it.
-        lines: in it.
-        x_label, y_label: of the axes.
+        title: title above the panel.
+        lines: the lines.
+        x_label, y_label: labels of the axes.
         x_scale, y_scale: "linear", "log", or for x "log2".
-        y_limits: lower and upper end, None for what the lines need.
-        x_ticks: places and their names; None for matplotlib's own.
+        y_limits: lower and upper end; None to fit the lines.
+        x_ticks: positions and labels; None for matplotlib's own.
     """
 
     title: str
@@ -87,13 +87,13 @@ def draw_panels(
     columns: int | None = None,
     legend: Literal["above", "below"] = "above",
 ) -> bytes:
-    """Draws panels with one legend for all.
+    """Draws panels with a shared legend.
 
     Args:
         panels: in reading order.
-        size: width and height of each, inches.
-        columns: panels in a row; None for all.
-        legend: where it stands.
+        size: width and height of each panel, inches.
+        columns: panels per row; None for all in one row.
+        legend: position of the legend.
 
     Returns:
         A PNG.

@@ -1,4 +1,4 @@
-"""Report pages: tables and figures on one self-contained HTML page, and how numbers are written in them."""
+"""Report pages: tables and figures on one self-contained HTML page, and the formatting of numbers."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class Table:
     """A table of text.
 
     Attributes:
-        columns: titles.
-        rows: cells, each row as long as ``columns``; the first cell names the row.
+        columns: column titles.
+        rows: cells, each row as long as ``columns``; the first cell is the row's name.
     """
 
     columns: Sequence[str]
@@ -37,11 +37,11 @@ class Table:
 
     @classmethod
     def of(cls, rows: Sequence[Mapping[str, Any]], shown: Callable[[Any], str]) -> Table:
-        """Rows of equal keys as a table, each value as ``shown`` writes it."""
+        """Table of rows with equal keys, each value formatted by ``shown``."""
         return cls(list(rows[0]), [[shown(value) for value in row.values()] for row in rows])
 
     def markdown(self, names: int = 1) -> str:
-        """The table as Markdown; all but the first ``names`` columns are set to the right."""
+        """The table as Markdown; all but the first ``names`` columns are right-aligned."""
         titles, marks = "| " + " | ".join(self.columns) + " |", ["---"] * names + ["---:"] * (len(self.columns) - names)
         lines = [titles.replace("|  |", "| |"), "| " + " | ".join(marks) + " |"]
         return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in self.rows)])
@@ -49,15 +49,15 @@ class Table:
 
 @dataclass(frozen=True)
 class Card:
-    """One box of a page: a title, a figure, a table, notes and a list, each where there is one.
+    """One box of a page: a title, a figure, a table, notes and code lines, all but the title optional.
 
     Attributes:
-        title: of the box.
+        title: title of the box.
         figure: PNG.
-        about: what the figure shows, for who does not see it.
-        table: below the figure.
-        notes: paragraphs in small print; text between backticks is set as code.
-        lines: set as code, one below another.
+        about: alternative text of the figure.
+        table: table below the figure.
+        notes: paragraphs in small print; text between backticks is shown as code.
+        lines: lines of code.
     """
 
     title: str = ""
@@ -81,12 +81,12 @@ class Page:
     """A page of results.
 
     Attributes:
-        name: for the window.
-        title: its heading.
+        name: window title.
+        title: main heading.
         intro: first paragraph.
-        sections: what was found.
-        command: the command line that makes it again.
-        methods: how it was measured: paragraphs by their headings.
+        sections: the results.
+        command: the command line that reproduces the page.
+        methods: paragraphs about the methods, by their headings.
     """
 
     name: str
@@ -97,22 +97,22 @@ class Page:
     methods: Mapping[str, str]
 
     def write(self, path: Path) -> None:
-        """Writes the page, pictures and all, into one file."""
+        """Writes the page with embedded pictures into one file."""
         files.write(path, render(_TEMPLATES / "page.html.jinja", {"inline": inline}, page=self))
 
 
 def inline(text: str) -> Markup:
-    """Text for HTML; what stands between backticks as code."""
+    """Escapes text for HTML; text between backticks becomes code."""
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def render(template: Path, filters: dict[str, Callable[..., Any]] | None = None, **values: Any) -> str:
-    """A page as one self-contained HTML text.
+    """Renders a page as one self-contained HTML text.
 
     Args:
         template: file of the template; it may extend ``base.html.jinja`` of this package.
-        filters: further filters for it.
-        **values: what it shows; ``versions``, ``python`` and ``date`` are there already.
+        filters: additional filters.
+        **values: its variables; ``versions``, ``python`` and ``date`` are always defined.
     """
     environment = Environment(
         loader=FileSystemLoader([template.parent, _TEMPLATES]),
@@ -131,7 +131,7 @@ def render(template: Path, filters: dict[str, Callable[..., Any]] | None = None,
 
 
 def format_number(value: float, digits: int = 2) -> str:
-    """A number for a table: a true minus sign, an en dash for what was not measured."""
+    """Formats a number for a table, with a true minus sign; an en dash stands for a missing value."""
     if math.isnan(value):
         return "–"
     text = f"{value:,.{digits}f}"
@@ -141,12 +141,12 @@ def format_number(value: float, digits: int = 2) -> str:
 
 
 def format_interval(interval: Interval, digits: int = 2) -> str:
-    """The ends of an interval for a table."""
+    """Formats the ends of an interval for a table."""
     if math.isnan(interval.low):
         return ""
     return f"{format_number(interval.low, digits)} … {format_number(interval.high, digits)}"
 
 
 def embedded(png: bytes) -> str:
-    """A picture as a data address, so that the page needs no other file."""
+    """A picture as a data URL, so that the page needs no other file."""
     return "data:image/png;base64," + base64.b64encode(png).decode("ascii")

@@ -22,7 +22,7 @@ class Interval:
     """An estimate with its confidence interval.
 
     Attributes:
-        estimate: what is estimated.
+        estimate: point estimate.
         low: lower end of the interval.
         high: upper end of the interval.
     """
@@ -33,7 +33,7 @@ class Interval:
 
 
 def mean_interval(values: Iterable[float]) -> Interval:
-    """Mean with its 95% t interval; NaN values are left out. One value has no interval: its ends are NaN."""
+    """Mean with its 95% t interval, without NaN values. For a single value, the ends of the interval are NaN."""
     given = np.asarray(list(values), dtype=np.float64)
     known = given[~np.isnan(given)]
     if len(known) == 0:
@@ -45,18 +45,18 @@ def mean_interval(values: Iterable[float]) -> Interval:
 
 
 def normalised(returns: ArrayLike, random: float, reference: float) -> Floats:
-    """Return on a scale on which random play is 0 and the reference is 1.
+    """Returns on a scale on which random play is 0 and the reference is 1.
 
     Args:
         returns: returns of any shape.
         random: mean return of the random policy.
-        reference: mean return of the reference, the exact optimum where it can be computed.
+        reference: mean return of the reference: the exact optimum if it can be computed.
 
     Returns:
         Float array of the same shape.
 
     Raises:
-        ValueError: the reference does not beat random play, so there is no scale.
+        ValueError: the reference is not better than random play, so there is no scale.
     """
     if not reference > random:
         raise ValueError(
@@ -89,9 +89,9 @@ def interquartile_mean(values: ArrayLike) -> Floats:
 def interquartile_interval(scores: ArrayLike, *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0) -> Interval:
     """Interquartile mean over runs, with a percentile bootstrap interval stratified by run.
 
-    Each resample draws runs with replacement and, inside every run drawn, episodes with replacement, so that
-    the interval holds both what differs between trainings and the luck of the evaluation. With a single run
-    only the latter can be seen.
+    Each resample draws runs with replacement and, within each drawn run, episodes with replacement, so that
+    the interval covers both the variation between trainings and the noise of the evaluation. With a single run,
+    it covers only the latter.
 
     Args:
         scores: floats [runs, episodes].
@@ -121,13 +121,13 @@ def ratio_interval(
 ) -> Interval:
     """(mean of scores - zero) / (mean of others - zero), with a percentile bootstrap interval stratified by run.
 
-    Both were played with the same luck, entry by entry, so both are resampled together. Plain means on both sides: a
-    ratio would flatter an agent whose bad runs alone were cut off.
+    Corresponding entries were played with the same random numbers, so both are resampled together. Both sides are plain
+    means: trimming could remove the bad runs of one agent only and favour it.
 
     Args:
         scores: floats [runs, episodes].
-        others: floats [runs, episodes], what they are measured against.
-        zero: what counts as nothing, such as random play's mean.
+        others: floats [runs, episodes] of the reference.
+        zero: zero point of the scale, such as the mean of random play.
         confidence: probability mass of the interval, between 0 and 1.
         resamples: number of bootstrap resamples.
         seed: seed of the resampling.
@@ -148,6 +148,6 @@ def ratio_interval(
 
 
 def _resample(runs: int, episodes: int, resamples: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], ...]:
-    """Index arrays that draw runs with replacement and, inside every run drawn, episodes with replacement."""
+    """Index arrays that draw runs with replacement and, within each drawn run, episodes with replacement."""
     drawn_runs = rng.integers(runs, size=(resamples, runs, 1))
     return drawn_runs, rng.integers(episodes, size=(resamples, runs, episodes))

@@ -1,6 +1,6 @@
-"""What the scripts that run other packages share: reading the world, the clock, and how results are handed back.
+"""Common code of the scripts that run other packages: input, timing and output.
 
-They run in an environment of their own, so nothing here may import mbagent.
+They run in a separate Python environment, so nothing here may import mbagent.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from numpy.typing import NDArray
 Array: TypeAlias = NDArray[Any]
 
 Search: TypeAlias = "Callable[[Array, int, int], tuple[Array, int]]"
-"""(roots int [R], simulations, seed) -> (actions int [R], next states sampled in all)."""
+"""(roots int [R], simulations, seed) -> (actions int [R], total number of sampled next states)."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """What to do; see ``studies.planning.peers``.
+    """The task of a script; see ``studies.planning.peers``.
 
     Attributes:
-        arrays: the world.
-        roots: int [R], to choose actions for.
-        simulations: budgets to choose actions with.
-        seeds: each budget is used once with each.
+        arrays: arrays of the MDP.
+        roots: roots, int [R].
+        simulations: budgets for choosing actions.
+        seeds: each budget is used once with each seed.
         speeds: (roots, simulations) to time, int [N, 2].
         repetitions: timed calls of each.
     """
@@ -45,7 +45,7 @@ class Task:
 
 
 def read_task(path: Path) -> Task:
-    """Reads the .npz that the main script has written."""
+    """Reads the .npz file written by the main script."""
     with np.load(path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     return Task(
@@ -59,7 +59,7 @@ def read_task(path: Path) -> Task:
 
 
 def stay_on_one_core() -> None:
-    """Confines this process to one core and one thread; to be called before packages that start threads are imported."""
+    """Restricts this process to one core and one thread; must be called before packages that start threads are imported."""
     os.environ["OMP_NUM_THREADS"] = "1"
     os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
     if hasattr(os, "sched_setaffinity"):
@@ -67,7 +67,7 @@ def stay_on_one_core() -> None:
 
 
 def run(task: Task, searches: dict[str, Search]) -> None:
-    """Lets every search choose and times it; prints one JSON text."""
+    """Lets each search choose actions, times it, and prints one JSON text."""
     results = {}
     for name, search in searches.items():
         choices = {str(n): [np.asarray(search(task.roots, n, seed)[0]).tolist() for seed in task.seeds] for n in task.simulations}
@@ -76,7 +76,7 @@ def run(task: Task, searches: dict[str, Search]) -> None:
 
 
 def _speed(task: Task, search: Search, n_roots: int, simulations: int) -> dict[str, float]:
-    """Median processor time of a call; the first call, which may compile, is left out."""
+    """Median processor time of a call; the first call, which may compile, is excluded."""
     roots = np.resize(task.roots, n_roots)
     _, samples = search(roots, simulations, 0)
     seconds = []

@@ -1,6 +1,6 @@
-"""Searches a table world with gymcts. Run by the Python of an environment that has gymcts: gymcts_search.py world.npz.
+"""Searches in a tabular MDP with gymcts. Run with a Python that has gymcts: gymcts_search.py world.npz.
 
-A leaf is worth what was earned on the way plus its discounted leaf value, in place of gymcts's random play.
+The value of a leaf is the discounted reward on its path plus its discounted leaf value, instead of gymcts's random play.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from gymcts.gymcts_env_abc import GymctsABC
 
 
 class TableEnv(GymctsABC):  # type: ignore[misc]
-    """The world as gymcts wants it: it can be put into any state, and says what a leaf is worth."""
+    """The MDP with the interface of gymcts: it can be set to any state, and returns leaf values as rollouts."""
 
     def __init__(self, arrays: dict[str, Array]) -> None:
         self.successors = arrays["successors"].tolist()
@@ -29,7 +29,7 @@ class TableEnv(GymctsABC):  # type: ignore[misc]
         self.gamma, self.ends = float(arrays["gamma"]), arrays["ends"].tolist()
         self.rewards, self.leaf_values = arrays["rewards"].tolist(), arrays["leaf_values"].tolist()
         self.valid = list(range(arrays["successors"].shape[1]))
-        # gymcts wants returns between -1 and 1: its exploration does not look at their range
+        # gymcts needs returns between -1 and 1: its exploration does not adapt to their range
         low, high = arrays["leaf_values"].min(), arrays["leaf_values"].max()
         self.middle, self.scale = float(low + high) / 2.0, 2.0 / max(float(high - low), 1e-9)
         self.action_space = gym.spaces.Discrete(len(self.valid))
@@ -38,7 +38,7 @@ class TableEnv(GymctsABC):  # type: ignore[misc]
         self.begin(0)
 
     def begin(self, state: int) -> None:
-        """Goes to a root."""
+        """Sets the state to a root."""
         self.at, self.earned, self.discount, self.done = state, 0.0, 1.0, False
 
     def get_state(self) -> Any:
@@ -62,15 +62,15 @@ class TableEnv(GymctsABC):  # type: ignore[misc]
         return None
 
     def rollout(self) -> float:
-        """What the present leaf is worth, seen from the root."""
+        """Rewards on the path to the current leaf plus its leaf value, discounted to the root and scaled."""
         value = 0.0 if self.done else self.leaf_values[self.at]
         return float((self.earned + self.discount * value - self.middle) * self.scale)
 
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
         """See gym.Env."""
-        luck, chosen = random.random(), 0
+        noise, chosen = random.random(), 0
         cumulated = self.cumulated[self.at][action]
-        while chosen < len(cumulated) - 1 and luck >= cumulated[chosen]:
+        while chosen < len(cumulated) - 1 and noise >= cumulated[chosen]:
             chosen += 1
         self.at = self.successors[self.at][action][chosen]
         self.earned += self.discount * self.rewards[self.at]
@@ -81,7 +81,7 @@ class TableEnv(GymctsABC):  # type: ignore[misc]
 
 
 def main(path: Path) -> None:
-    """Runs gymcts with its own settings, one root after the other."""
+    """Runs gymcts with its own settings, one root after another."""
     task = read_task(path)
     env = TableEnv(task.arrays)
 

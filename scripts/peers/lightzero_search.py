@@ -1,7 +1,7 @@
-"""Searches a table world with LightZero's C++ tree of MuZero. Run by the Python of an environment that has LightZero's wheel.
+"""Searches in a tabular MDP with LightZero's C++ tree of MuZero. Run with a Python that has LightZero's wheel.
 
 Only the compiled tree is loaded, by its path, so the wheel is enough (pip install --no-deps LightZero): neither torch nor
-DI-engine is needed. The loop is LightZero's own (mcts_ctree.py: MuZeroMCTSCtree.search), with the table for the network.
+DI-engine is needed. The loop is LightZero's own (mcts_ctree.py: MuZeroMCTSCtree.search), with the table instead of the network.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def load_tree() -> Any:
     """The compiled module.
 
     Raises:
-        ImportError: it is not there, or does not load.
+        ImportError: it is missing or cannot be loaded.
     """
     folder = Path(sysconfig.get_paths()["purelib"]) / "lzero/mcts/ctree/ctree_muzero"
     found = sorted(folder.glob("mz_tree*.so")) + sorted(folder.glob("mz_tree*.pyd"))
@@ -39,7 +39,7 @@ def load_tree() -> Any:
 
 
 def search_tree(tree: Any, arrays: dict[str, Array], roots: Array, simulations: int, rng: np.random.Generator) -> Array:
-    """Actions [R] by visits, as LightZero acts when it is evaluated."""
+    """Actions [R] by visits, as in LightZero's evaluation."""
     n_roots, n_actions = len(roots), arrays["successors"].shape[1]
     cumulated, gamma = arrays["cumulated"], float(arrays["gamma"])
     nobody, flat = [-1] * n_roots, [[0.0] * n_actions for _ in range(n_roots)]
@@ -53,10 +53,10 @@ def search_tree(tree: Any, arrays: dict[str, Array], roots: Array, simulations: 
         results = tree.ResultsWrapper(num=n_roots)
         path, batch, actions, players = tree.batch_traverse(nodes, PB_C_BASE, PB_C_INIT, gamma, stats, results, nobody)
         at = states[path, batch]
-        luck = rng.random(n_roots)
-        chosen = (luck[:, None] >= cumulated[at, actions, :-1]).sum(axis=1)
+        noise = rng.random(n_roots)
+        chosen = (noise[:, None] >= cumulated[at, actions, :-1]).sum(axis=1)
         following = states[simulation] = arrays["successors"][at, actions, chosen]
-        # Nodes cannot end here; states that do lead to themselves and earn nothing (see ``without_ends``).
+        # Nodes cannot terminate; terminated states lead to themselves with reward 0 (see ``without_ends``).
         rewards, values = arrays["rewards"][at, following], arrays["leaf_values"][following]
         tree.batch_backpropagate(simulation, gamma, rewards.tolist(), values.tolist(), flat, stats, results, players)
     best: Array = np.asarray(nodes.get_distributions()).argmax(axis=1)
@@ -64,9 +64,9 @@ def search_tree(tree: Any, arrays: dict[str, Array], roots: Array, simulations: 
 
 
 def without_ends(arrays: dict[str, Array]) -> dict[str, Array]:
-    """The same world for a tree that knows no end: ended states are traps, worth nothing, in which nothing is earned.
+    """The same MDP for a tree without termination: terminated states become absorbing, with value and reward 0.
 
-    Rewards become [S, S'], since arrival in a trap pays only from outside of it.
+    Rewards become [S, S'], since arrival in an absorbing state is rewarded only from outside of it.
     """
     ends, successors = arrays["ends"], arrays["successors"].copy()
     successors[ends] = np.flatnonzero(ends)[:, None, None]

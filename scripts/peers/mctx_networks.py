@@ -1,7 +1,7 @@
-"""Searches with mctx through a learned predictor and causal conditioner. Run as: mctx_networks.py networks.npz.
+"""Searches with mctx, a learned predictor and a causal conditioner. Run as: mctx_networks.py networks.npz.
 
-The networks are sampled in JAX as ``mbagent.models.samplers.sample_causal`` does: a variable that the predictor is sure of is
-drawn from it, every other one from the conditioner, given those drawn before it.
+The networks are sampled in JAX as in ``mbagent.models.neural.sampling.sample_causal``: variables of which the predictor is
+certain are sampled from it, all others from the conditioner, given those sampled before.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ import numpy as np
 Params = dict[str, Any]
 
 MAX_DEPTH = 15
-"""Steps from the root, at most."""
+"""Maximum number of steps from the root."""
 
 
 def predict(params: Params, states: Any, actions: Any) -> tuple[Any, Any]:
-    """Logits [B, O] of the bits, and the input columns [B, n_inputs]."""
+    """Logits [B, O] of the bits, and the encoded inputs [B, n_inputs]."""
     hot = jax.nn.one_hot(actions, params["dense_stay"].shape[0])
     columns = jnp.concatenate([states, hot], axis=1)
     hidden = jax.nn.silu(columns @ params["dense_first"] + params["dense_bias"][0])
@@ -41,18 +41,18 @@ def predict(params: Params, states: Any, actions: Any) -> tuple[Any, Any]:
 def sample(params: Params, key: Any, states: Any, actions: Any) -> Any:
     """Next bits [B, O], ``terminated`` last."""
     logits, columns = predict(params, states, actions)
-    luck = jax.random.uniform(key, logits.shape)
+    noise = jax.random.uniform(key, logits.shape)
     p = jax.nn.sigmoid(logits)
     sure = jnp.maximum(p, 1.0 - p) >= params["certain"]
-    drawn = (luck < p).astype(jnp.float32)
+    drawn = (noise < p).astype(jnp.float32)
     known = jnp.einsum("bi,gih->gbh", columns, params["group_inputs"]) + params["group_bias"][:, None, :]
 
     def condition(outcome: Any, group: Any) -> tuple[Any, None]:
-        # A conditioner masked to y_<i has weight 0 on what is not drawn yet, so all of ``outcome`` can be shown.
+        # A conditioner masked to y_<i has weight 0 for bits not sampled yet, so all of ``outcome`` can be its input.
         hidden = jax.nn.silu(group["known"] + outcome @ group["others"])
         i = group["member"]
         logit = logits[:, i] + hidden @ group["readout"][:, 1] + group["offset"][1]
-        bit = (luck[:, i] < jax.nn.sigmoid(logit)).astype(jnp.float32)
+        bit = (noise[:, i] < jax.nn.sigmoid(logit)).astype(jnp.float32)
         return outcome.at[:, i].set(jnp.where(sure[:, i], outcome[:, i], bit)), None
 
     groups = {
@@ -67,7 +67,7 @@ def sample(params: Params, key: Any, states: Any, actions: Any) -> Any:
 
 
 def recurrent(params: Params, key: Any, actions: Any, states: Any) -> tuple[Any, Any]:
-    """The recurrent_fn: samples the networks; leaves are worth 0."""
+    """The recurrent_fn: samples the networks; leaf values are 0."""
     outcome = sample(params, key, states, actions)
     following, ended = outcome[:, :-1], outcome[:, -1]
     reward = following @ params["linear"] + jnp.einsum("bi,ij,bj->b", following, params["pairs"], following)

@@ -1,6 +1,6 @@
-"""Searches a table world with mctx's policies. Run by the Python of an environment that has mctx: mctx_search.py world.npz.
+"""Searches in a tabular MDP with mctx's policies. Run with a Python that has mctx: mctx_search.py world.npz.
 
-Settings are those for acting, not for exploring: no Gumbel noise, no Dirichlet noise, temperature 0. Priors are uniform.
+Settings are those for evaluation, without exploration: no Gumbel noise, no Dirichlet noise, temperature 0. Priors are uniform.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ import numpy as np
 Params = dict[str, Any]
 
 MAX_DEPTH = 15
-"""Steps from the root, at most: what lies beyond counts for less than half, and unbounded trees are up to four times slower."""
+"""Maximum number of steps from the root: later ones have weight below half, and unbounded trees are up to four times slower."""
 
 
 def arrive(params: Params, states: Any) -> tuple[Any, Any, Any]:
-    """Reward, discount and leaf value [B] of states just reached."""
+    """Reward, discount and leaf value [B] on arrival in states."""
     discount = jnp.where(params["ends"][states], 0.0, params["gamma"])
     return params["rewards"][states], discount, params["leaf_values"][states]
 
 
 def sample_step(params: Params, key: Any, actions: Any, states: Any) -> tuple[Any, Any]:
-    """The recurrent_fn: draws next states from the table."""
+    """The recurrent_fn: samples next states from the table."""
     log_p = jnp.log(params["probabilities"][states, actions])
     chosen = jax.random.categorical(key, log_p, axis=-1)
     following = params["successors"][states, actions, chosen]
@@ -42,7 +42,7 @@ def sample_step(params: Params, key: Any, actions: Any, states: Any) -> tuple[An
 
 
 def decide(params: Params, key: Any, actions: Any, states: Any) -> tuple[Any, Any]:
-    """The decision_recurrent_fn: the outcomes' exact probabilities, and what they are worth by the leaf values."""
+    """The decision_recurrent_fn: exact probabilities of the outcomes, and their expected reward plus discounted leaf value."""
     del key
     probabilities = params["probabilities"][states, actions]
     following = params["successors"][states, actions]
@@ -53,7 +53,7 @@ def decide(params: Params, key: Any, actions: Any, states: Any) -> tuple[Any, An
 
 
 def take_chance(params: Params, key: Any, outcomes: Any, afterstates: Any) -> tuple[Any, Any]:
-    """The chance_recurrent_fn: the state that outcome number so and so leads to."""
+    """The chance_recurrent_fn: the state of a given outcome number."""
     del key
     n = afterstates.shape[1]
     following = jnp.take_along_axis(afterstates, jnp.clip(outcomes, 0, n - 1)[:, None], axis=1)[:, 0]
@@ -71,7 +71,7 @@ def root_of(params: Params, states: Any) -> Any:
 
 @partial(jax.jit, static_argnames="simulations")
 def gumbel(params: Params, key: Any, states: Any, simulations: int) -> tuple[Any, Any]:
-    """Actions [B], and how many next states were sampled."""
+    """Actions [B], and the number of sampled next states."""
     found = mctx.gumbel_muzero_policy(
         params, key, root_of(params, states), sample_step, simulations, max_depth=MAX_DEPTH, gumbel_scale=0.0
     )
@@ -80,7 +80,7 @@ def gumbel(params: Params, key: Any, states: Any, simulations: int) -> tuple[Any
 
 @partial(jax.jit, static_argnames="simulations")
 def stochastic(params: Params, key: Any, states: Any, simulations: int) -> tuple[Any, Any]:
-    """Actions [B], and how many next states were imagined: a simulation that ends at a chance node adds none."""
+    """Actions [B], and the number of expanded next states: a simulation that ends at a chance node adds none."""
     found = mctx.stochastic_muzero_policy(
         params,
         key,
@@ -88,7 +88,7 @@ def stochastic(params: Params, key: Any, states: Any, simulations: int) -> tuple
         decide,
         take_chance,
         simulations,
-        max_depth=2 * MAX_DEPTH,  # a step is two levels of the tree
+        max_depth=2 * MAX_DEPTH,  # a step spans two levels of the tree
         dirichlet_fraction=0.0,
         temperature=0.0,
     )

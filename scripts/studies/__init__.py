@@ -1,6 +1,6 @@
-"""The studies: each measures one thing, and a command in the folder above runs it."""
+"""The studies, each of which is run by a command in the parent folder."""
 
 from pathlib import Path
 
 TEMPLATES = Path(__file__).parent / "templates"
-"""Folder of the pages' templates."""
+"""Folder of the page templates."""

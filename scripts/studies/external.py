@@ -1,4 +1,4 @@
-"""How the agent plays environments that are not its own, compared with the exact optimum, its planner on true rules and SB3.
+"""The agent on environments of other packages, compared with the exact optimum, its planner on the true rules, and SB3.
 
 A cell is one agent in one world with one seed: it learns, plays whole episodes, and is timed.
 """
@@ -30,10 +30,10 @@ from worlds.registry import ARCADE, CONTINUOUS, WORLDS, World, for_networks
 
 OURS, TRUE, IMAGINED = "mbagent", "mbagent, true model", "PPO in LearnedEnv"
 AGENTS = (OURS, TRUE, "PPO", "DQN", IMAGINED, "random")
-"""Agents: this one; its planner on the true rules; SB3's; SB3's PPO trained in what this one learned; random play."""
+"""Agents: this one; its planner on the true rules; SB3's; SB3's PPO trained in the learned environment; random play."""
 
 TIMED = 100
-"""Observations met in play on which single decisions are timed."""
+"""Number of observations from play on which single decisions are timed."""
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,13 @@ class Cell:
     """One agent in one world, with one seed.
 
     Attributes:
-        world: where.
+        world: the environment.
         agent: one of AGENTS.
-        seed: of learning and play.
+        seed: seed of learning and play.
         steps: environment steps for learning.
-        episodes: to play.
-        baseline_steps: steps for the baselines, which may be more.
-        reward_scale: what their rewards are multiplied with for training; None for their usual scale.
+        episodes: episodes to play.
+        baseline_steps: training steps of the baselines, which may be more.
+        reward_scale: factor of their rewards in training; None for their default.
     """
 
     world: World
@@ -61,7 +61,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Player:
-    """A policy with what it took to get it."""
+    """A policy and the cost of its training."""
 
     policy: Policy
     steps: int
@@ -70,10 +70,10 @@ class Player:
 
 
 def run_cell(cell: Cell) -> Result[Cell]:
-    """Learns, plays and times. The normalised return is of the exact return where that is known, else of the episodes'."""
+    """Learns, plays and times. The normalised return uses the exact return if it is known, else the returns of episodes."""
     torch.set_num_threads(1)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that the reward is learned, and of packages around
+        warnings.simplefilter("ignore")  # of a learned reward, and of other packages
         scale = scale_of(cell.world)
         results = [(player, *_played(cell, player)) for player in (make() for make in _players(cell))]
         player, returns, milliseconds = max(results, key=lambda result: result[1].mean())
@@ -99,7 +99,7 @@ def run_cell(cell: Cell) -> Result[Cell]:
 
 
 def _players(cell: Cell) -> Sequence[Callable[[], Player]]:
-    """How to get the agent; of SB3's there are two, which act by their likeliest actions or draw them: the better counts."""
+    """Ways to create the agent's player; SB3's have two, with the most likely or with sampled actions: the better one counts."""
     if cell.agent == OURS:
         return (partial(_ours, cell),)
     if cell.agent == TRUE:
@@ -113,7 +113,7 @@ def _players(cell: Cell) -> Sequence[Callable[[], Player]]:
         env = cell.world.make()
         agent = _learned(cell, env)
         limit = _limit(env)
-        make_env = partial(_imagined, agent, limit)
+        make_env = partial(_learned_env, agent, limit)
     name = cast("BaselineName", "PPO" if cell.agent == IMAGINED else cell.agent)
     began = time.perf_counter()
     algorithm, _ = train_baseline(
@@ -143,12 +143,12 @@ def _learned(cell: Cell, env: gym.Env[Any, Any]) -> ModelLearningAgent:
     return agent.learn(cell.steps, log_interval=None)
 
 
-def _imagined(agent: ModelLearningAgent, limit: int | None) -> gym.Env[Any, Any]:
+def _learned_env(agent: ModelLearningAgent, limit: int | None) -> gym.Env[Any, Any]:
     return for_networks(LearnedEnv(agent, max_episode_steps=limit))
 
 
 def _limit(env: gym.Env[Any, Any]) -> int | None:
-    """The steps of an episode, wherever a package keeps them."""
+    """The step limit of an episode, wherever the package stores it."""
     inner: Any = env.unwrapped
     found = getattr(env.spec, "max_episode_steps", None) or getattr(inner, "max_steps", None)
     return int(found) if found else getattr(getattr(inner, "rddl", None), "horizon", None)
@@ -163,44 +163,44 @@ def _ours(cell: Cell) -> Player:
 def _with_true_model(cell: Cell) -> Player:
     known = true_model(cell.world)
     if known is None:
-        raise ValueError(f"The true rules of {cell.world.name} are not at hand.")
+        raise ValueError(f"The true rules of {cell.world.name} are not available.")
     model, reward = known
     agent = ModelLearningAgent("MctsPolicy", cell.world.make(), model=model, reward=reward, seed=cell.seed)
     return Player(as_policy(agent), 0, 0.0, True)
 
 
 def _seen_as_by_networks(world: World, policy: Policy) -> Policy:
-    """A policy on observations as the world shows them."""
+    """Converts a policy on the networks' observations to one on the world's own."""
     if world.kind != "minigrid":
         return policy
     return lambda obs: policy(np.asarray(obs).reshape(len(obs), -1).astype(np.float32) / 10)
 
 
 def _played(cell: Cell, player: Player) -> tuple[np.ndarray, float]:
-    """Returns of whole episodes, and milliseconds of a decision about one observation."""
+    """Returns of whole episodes, and milliseconds per decision for one observation."""
     returns = evaluate_env(
         cell.world.make, player.policy, episodes=cell.episodes, seed=cell.seed, repeatable=player.repeatable
     ).default
-    return returns, milliseconds_per_decision(player.policy, _met(cell, player.policy))
+    return returns, milliseconds_per_decision(player.policy, _observed(cell, player.policy))
 
 
 def _exact_return(cell: Cell, player: Player) -> float:
-    """Expected return, where the rules are known and the player always does the same; else NaN."""
+    """Expected return if the rules are known and the player is deterministic; else NaN."""
     known = exact_world(cell.world)
     return known.policy_return(player.policy(known.observations)) if known is not None and player.repeatable else float("nan")
 
 
-def _met(cell: Cell, policy: Policy) -> np.ndarray:
-    """Observations met in play, one copy."""
+def _observed(cell: Cell, policy: Policy) -> np.ndarray:
+    """Observations from play in one copy of the environment."""
     env = cell.world.make()
-    met: list[Any] = []
+    observed: list[Any] = []
     obs, _ = env.reset(seed=cell.seed)
-    while len(met) < TIMED:
-        met.append(obs)
+    while len(observed) < TIMED:
+        observed.append(obs)
         obs, _, terminated, truncated, _ = env.step(int(policy(np.asarray(obs)[None])[0]))
         if terminated or truncated:
             obs, _ = env.reset()
-    return np.stack(met)
+    return np.stack(observed)
 
 
 def show(rows: Sequence[Row], run: Run) -> None:
@@ -220,14 +220,14 @@ def show(rows: Sequence[Row], run: Run) -> None:
         figures += [f"{mean['learn_seconds']:.1f}", f"{mean['milliseconds']:.2f}"]
         lines.append([world, agent, *("–" if figure == "nan" else figure for figure in figures)])
     names = ("world", "agent", "steps", "return", "exact", "optimum", "normalised", "95%", "return > 0", "learning, s")
-    run.show("Environments that are not the agent's own", (*names, "decision, ms"), lines, width=150)
+    run.show("Environments of other packages", (*names, "decision, ms"), lines, width=150)
 
 
 def markdown_table(paths: Sequence[Path]) -> str:
-    """From files of rows as ``run_cell`` makes them; where a world and an agent are in several, the last one counts.
+    """Markdown table from files with the rows of ``run_cell``; if a world and an agent are in several, the last one counts.
 
-    Normalised return as interquartile mean over trainings; where the optimum is not known, the share of episodes with a return
-    above 0; seconds and milliseconds as medians, as the first training compiles and a single one may plan in another way.
+    Normalised returns are interquartile means over trainings; if the optimum is not known, the share of episodes with a return
+    above 0 is shown. Times are medians, since the first training includes compilation and single ones may plan differently.
     """
     found: dict[tuple[str, str], list[dict[str, str]]] = {}
     for path in paths:

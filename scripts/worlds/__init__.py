@@ -1,1 +1,1 @@
-"""The environments that the studies use, and their exact rules where these are known."""
+"""The environments of the studies, with their exact rules if these are known."""

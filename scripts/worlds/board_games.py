@@ -1,6 +1,6 @@
-"""Games that no model was made for, to see what carries over: two players at once, a box that is pushed, a switch for walls.
+"""Games for which no model was designed, to test generality: two players at once, a box that is pushed, a switch for walls.
 
-Their states are a square board of planes, like Maneuverer's; they have no reward, since nobody plays them.
+Their states are a square board of planes, like Maneuverer's; they have no reward, since they are not played.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ REDRAWN = 7
 
 
 class BoardWorld(Game):
-    """A board of three planes, size x size, and some further bits; some states lead to a new layout, whatever the action."""
+    """A board of three planes, size x size, and some further bits; some states lead to a new layout with any action."""
 
     max_episode_steps: ClassVar[int] = 100
     size: ClassVar[int] = 6
@@ -37,7 +37,7 @@ class BoardWorld(Game):
         super().__init__(observation_shape=(n_bits,), action_names=("up", "right", "down", "left"), goals={})
 
     def over(self, obs: Bits) -> Bools:
-        """Which states [B, n] are followed by a new layout: those with a player on the target."""
+        """Whether each state [B, n] is followed by a new layout, as is the case with a player on the target."""
         planes = self.planes(obs)
         return np.asarray((planes[:, 0] & planes[:, 2]).any(axis=1))
 
@@ -78,28 +78,28 @@ class BoardWorld(Game):
         inside: Bools = (row >= 0) & (row < self.size) & (column >= 0) & (column < self.size)
         return np.where(inside, row * self.size + column, 0), inside
 
-    def scatter(self, luck: Floats, things: tuple[Ints, ...]) -> Bits:
-        """Layouts with a thing in cell things[p] of plane 0 or 2, and walls by ``luck`` [B, cells] where nothing is."""
-        obs, rows = self.blank(len(luck)), np.arange(len(luck))
+    def scatter(self, noise: Floats, things: tuple[Ints, ...]) -> Bits:
+        """Layouts with objects in cells ``things`` of plane 0 (the last: plane 2) and random walls by ``noise`` [B, cells]."""
+        obs, rows = self.blank(len(noise)), np.arange(len(noise))
         planes = self.planes(obs)
-        planes[:, 1] = luck < self.wall_density
+        planes[:, 1] = noise < self.wall_density
         for number, cells in enumerate(things):
             planes[rows, 2 if number == len(things) - 1 else 0, cells] = 1
             planes[rows, 1, cells] = 0
         return obs
 
-    def cells_of(self, luck: Floats) -> Ints:
-        """Cells from uniform numbers."""
-        return (luck * self.size**2).astype(np.int64)
+    def cells_of(self, noise: Floats) -> Ints:
+        """Cells chosen by uniform random numbers."""
+        return (noise * self.size**2).astype(np.int64)
 
 
 class TwoPlayers(BoardWorld):
-    """Two players in one plane, who both move with the action; a new layout where one of them was on the target."""
+    """Two players in one plane, both moved by the action; a new layout follows when one of them is on the target."""
 
     def initial(self, keys: Keys) -> Bits:
         """See Game."""
-        luck = uniforms(keys, 3 + self.size**2)
-        return self.scatter(luck[:, 3:], tuple(self.cells_of(luck[:, i]) for i in range(3)))
+        noise = uniforms(keys, 3 + self.size**2)
+        return self.scatter(noise[:, 3:], tuple(self.cells_of(noise[:, i]) for i in range(3)))
 
     def move(self, obs: Bits, actions: Ints, keys: Keys) -> Bits:
         """See BoardWorld."""
@@ -107,23 +107,23 @@ class TwoPlayers(BoardWorld):
         before, after = self.planes(obs), self.planes(following)
         row, cell = np.nonzero(before[:, 0])
         target, inside = self.step(cell, actions[row])
-        goes = inside & (before[row, 1, target] == 0)
+        moves = inside & (before[row, 1, target] == 0)
         after[:, 0] = 0
-        after[row, 0, np.where(goes, target, cell)] = 1
+        after[row, 0, np.where(moves, target, cell)] = 1
         return following
 
 
 class PushedBox(BoardWorld):
-    """A box that the player pushes if the cell behind it is free; a new layout where it was in a corner."""
+    """A box that the player pushes if the cell behind it is free; a new layout follows when it is in a corner."""
 
     wall_density: ClassVar[float] = 0.15
 
     def initial(self, keys: Keys) -> Bits:
         """See Game."""
-        luck, inner = uniforms(keys, 3 + self.size**2), self.size - 2
-        row, column = 1 + (luck[:, 1] * inner).astype(np.int64), 1 + (luck[:, 2] * inner).astype(np.int64)
-        player, box = self.cells_of(luck[:, 0]), row * self.size + column
-        return self.scatter(luck[:, 3:], (player, np.where(box == player, (row % inner + 1) * self.size + column, box)))
+        noise, inner = uniforms(keys, 3 + self.size**2), self.size - 2
+        row, column = 1 + (noise[:, 1] * inner).astype(np.int64), 1 + (noise[:, 2] * inner).astype(np.int64)
+        player, box = self.cells_of(noise[:, 0]), row * self.size + column
+        return self.scatter(noise[:, 3:], (player, np.where(box == player, (row % inner + 1) * self.size + column, box)))
 
     def over(self, obs: Bits) -> Bools:
         """See BoardWorld."""
@@ -139,8 +139,8 @@ class PushedBox(BoardWorld):
         behind, beyond = self.step(target, actions)
         pushes = inside & (target == box)
         room = beyond & (before[rows, 1, behind] == 0)
-        goes = inside & (before[rows, 1, target] == 0) & (~pushes | room)
-        moved, pushed = np.flatnonzero(goes), np.flatnonzero(goes & pushes)
+        moves = inside & (before[rows, 1, target] == 0) & (~pushes | room)
+        moved, pushed = np.flatnonzero(moves), np.flatnonzero(moves & pushes)
         after[moved, 0], after[pushed, 2] = 0, 0
         after[moved, 0, target[moved]] = 1
         after[pushed, 2, behind[pushed]] = 1
@@ -148,15 +148,15 @@ class PushedBox(BoardWorld):
 
 
 class Switch(BoardWorld):
-    """Maneuverer with a switch that flips now and then: walls block only while it is off."""
+    """Maneuverer with a switch that flips at random: walls block only while it is off."""
 
     n_switches: ClassVar[int] = 1
 
     def initial(self, keys: Keys) -> Bits:
         """See Game."""
-        luck = uniforms(keys, 3 + self.size**2)
-        obs = self.scatter(luck[:, 3:], (self.cells_of(luck[:, 0]), self.cells_of(luck[:, 1])))
-        obs[:, -1] = luck[:, 2] < 0.5
+        noise = uniforms(keys, 3 + self.size**2)
+        obs = self.scatter(noise[:, 3:], (self.cells_of(noise[:, 0]), self.cells_of(noise[:, 1])))
+        obs[:, -1] = noise[:, 2] < 0.5
         return obs
 
     def move(self, obs: Bits, actions: Ints, keys: Keys) -> Bits:

@@ -1,4 +1,4 @@
-"""Worlds of many noisy, weakly coupled variables, too large to solve."""
+"""MDPs with many noisy, weakly coupled variables, too large to solve."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from mbagent_envs.random_keys import uniforms
 
 
 class IndependentModel(ExactModel):
-    """A world whose variables change independently, given state and action; no episode ends.
+    """An MDP whose next values are independent given state and action; no episode terminates.
 
     Args:
-        cardinalities: of the variables.
+        cardinalities: number of values of each variable.
         n_actions: number of actions.
         chances: ``chances(states [B, F], actions [B]) -> float64 [B, F, K]``, the distribution of each variable.
     """
@@ -29,9 +29,9 @@ class IndependentModel(ExactModel):
 
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
         """See TransitionModel."""
-        luck = uniforms(as_keys(rng, len(states)), states.shape[1])
+        noise = uniforms(as_keys(rng, len(states)), states.shape[1])
         below = np.cumsum(self._chances(states, actions), axis=2)[:, :, :-1]
-        return (below <= luck[:, :, None]).sum(axis=2), np.zeros(len(states), dtype=np.bool_)
+        return (below <= noise[:, :, None]).sum(axis=2), np.zeros(len(states), dtype=np.bool_)
 
     def marginals(self, states: States, actions: Actions) -> Floats:
         """See TransitionModel."""
@@ -49,13 +49,13 @@ class IndependentModel(ExactModel):
 
 @dataclass(frozen=True)
 class CoupledWorld:
-    """What is played.
+    """An MDP with its goal.
 
     Attributes:
-        name: what it is called.
+        name: its name.
         model: its rules.
-        goal: what is wanted.
-        start: int64 [S, F], start states.
+        goal: its reward function.
+        start: start states, int64 [S, F].
     """
 
     name: str
@@ -69,7 +69,7 @@ def _bits(on: Floats) -> Floats:
 
 
 def corridor(n_lights: int = 12, cells: int = 12) -> CoupledWorld:
-    """A corridor whose last cell is to be reached and kept; many lights beside it flicker and mean nothing."""
+    """A corridor whose last cell is to be reached and kept, with many irrelevant, flickering lights."""
 
     def chances(states: States, actions: Actions) -> Floats:
         rows, cell = np.arange(len(states)), states[:, 0]
@@ -87,7 +87,7 @@ def corridor(n_lights: int = 12, cells: int = 12) -> CoupledWorld:
 
 
 def ring(n: int = 16) -> CoupledWorld:
-    """Machines in a ring that fail, the sooner the more their neighbour has failed; one can be started anew in each step."""
+    """Computers in a ring, which fail more often next to a failed neighbour; one can be restarted in each step."""
 
     def chances(states: States, actions: Actions) -> Floats:
         on = np.where(states == 1, 0.45 + 0.25 * (1 + np.roll(states, 1, axis=1)), 0.05)
@@ -102,7 +102,7 @@ def ring(n: int = 16) -> CoupledWorld:
 
 
 def cells(size: int = 4) -> CoupledWorld:
-    """Conway's game of life with noise; a cell can be set in each step."""
+    """Conway's game of life with noise; one cell can be set in each step."""
     n = size * size
 
     def chances(states: States, actions: Actions) -> Floats:

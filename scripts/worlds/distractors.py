@@ -1,4 +1,4 @@
-"""Made-up worlds whose rules are known: a table that actions move through, and beside it bits that flicker whatever is done."""
+"""Synthetic environments with known rules: a controllable core, given as a table, and distractor bits that change at random."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from mbagent.models.protocol import TransitionModel
 from mbagent.types import Actions, Bools, Ints, States
 
 FLICKER = 0.3
-"""Probability that a bit changes in a step."""
+"""Probability that a distractor bit changes in a step."""
 
 DRAWN = 40
-"""Outcomes drawn of each (state, action) to measure how wrong a model is."""
+"""Samples per (state, action) for measuring the model error."""
 
 
 @dataclass(frozen=True)
 class Core:
-    """What actions move through.
+    """The controllable core.
 
     Attributes:
         values: the factors of its S states, int64 [S, K].
         going: the next state, int64 [S, A].
-        over: whether the episode ends there, bool [S, A].
-        slip: probability that any action happens in place of the one taken.
+        over: whether the episode terminates, bool [S, A].
+        slip: probability that a random action replaces the chosen one.
     """
 
     values: Ints
@@ -38,24 +38,24 @@ class Core:
     slip: float = 0.0
 
     def reachable(self) -> Ints:
-        """States in which an episode can be under way; all begin in state 0."""
-        met: set[int] = set()
+        """Non-terminal states that an episode can reach; all episodes start in state 0."""
+        visited: set[int] = set()
         stack = [0]
         while stack:
-            if (state := stack.pop()) not in met:
-                met.add(state)
+            if (state := stack.pop()) not in visited:
+                visited.add(state)
                 stack += [int(s) for s in self.going[state][~self.over[state]]]
-        return np.array(sorted(met))
+        return np.array(sorted(visited))
 
 
 @dataclass(frozen=True)
 class DistractorWorld:
-    """A core with bits beside it.
+    """A core with distractor bits.
 
     Attributes:
-        name: what the results call it.
-        core: makes the core.
-        bits: number of bits.
+        name: name in the results.
+        core: creates the core.
+        bits: number of distractor bits.
         limit: steps after which an episode is truncated.
     """
 
@@ -74,7 +74,7 @@ class DistractorWorld:
         return gym.wrappers.TimeLimit(_DistractorEnv(self.known, self.bits), self.limit)
 
     def wrongness(self, model: TransitionModel, numbers: Ints, actions: Actions) -> float:
-        """Mean total variation between a model and the rules, for core states [N] and actions [N] with bits drawn by lot."""
+        """Mean total variation between a model and the rules, for core states [N] and actions [N] with random distractor bits."""
         rng, core, n = np.random.default_rng(0), self.known, len(actions) * DRAWN
         numbers, actions = np.repeat(numbers, DRAWN), np.repeat(actions, DRAWN)
         bits, flipped = rng.integers(2, size=(n, self.bits)), rng.random((n, self.bits)) < FLICKER
@@ -89,10 +89,10 @@ class DistractorWorld:
         return float(np.maximum(0.0, 1.0 - np.exp(said - truth)).mean())
 
     def tried(self, states: States, actions: Actions) -> float:
-        """Share of the core's reachable (state, action) that are among transitions [N]."""
+        """Share of the core's reachable (state, action) that occur in transitions [N]."""
         core = self.known
-        met = np.unique(np.column_stack([states[:, : core.values.shape[1]], actions]), axis=0)
-        return len(met) / core.going[core.reachable()].size
+        visited = np.unique(np.column_stack([states[:, : core.values.shape[1]], actions]), axis=0)
+        return len(visited) / core.going[core.reachable()].size
 
 
 class _DistractorEnv(gym.Env[Any, Any]):
@@ -118,7 +118,7 @@ class _DistractorEnv(gym.Env[Any, Any]):
 
 
 def chain(n: int) -> Core:
-    """One of two actions goes on, which one differs from cell to cell; the other leads back to the start."""
+    """One of two actions moves forward (which one differs between cells); the other leads back to the start."""
     right, cells = np.random.default_rng(n).integers(2, size=n), np.arange(n)
     going = np.zeros((n, 2), dtype=np.int64)
     going[cells, right] = (cells + 1) % n
@@ -126,7 +126,7 @@ def chain(n: int) -> Core:
 
 
 def grid(n: int, walls: float = 0.0) -> Core:
-    """A field of n times n cells, four ways to go; a share of the cells are walls, but never the first row or column."""
+    """A grid of n times n cells with four moves; a share of the cells, except in the first row and column, are walls."""
     free = np.random.default_rng(n).random((n, n)) >= walls
     free[0], free[:, 0] = True, True
     values = np.argwhere(np.ones((n, n), dtype=np.bool_))
@@ -136,9 +136,9 @@ def grid(n: int, walls: float = 0.0) -> Core:
 
 
 def key_and_door(n: int) -> Core:
-    """A field with a wall across; its door opens, and later shuts, for who has taken the key up, standing before it.
+    """A grid divided by a wall with a door, which a player who stands in front of it with the key can open and shut.
 
-    Actions are four ways to go, take, and use. Factors are row, column, whether the key was taken, whether the door is open.
+    Actions are four moves, take, and use. Factors are row, column, whether the key was taken, whether the door is open.
     """
     sizes, wall = (n, n, 2, 2), n // 2
     values = np.array(list(np.ndindex(*sizes)))
@@ -168,4 +168,4 @@ DISTRACTORS = (
     DistractorWorld("key and door 8x8, 8 lights", lambda: key_and_door(8), 8, 200),
     DistractorWorld("14 lights", lambda: nothing(4), 14, 200),
 )
-"""Worlds to measure exploration in; the bits are lights that flicker."""
+"""Environments for measuring exploration; the distractor bits are flickering lights."""

@@ -1,4 +1,4 @@
-"""What the agents are compared on: games with their settings."""
+"""The cases on which agents are compared: games with their settings."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class Case:
 
     Attributes:
         key: short name, used in results.csv.
-        world: the environment; the report calls it by its name.
+        world: the environment; the report uses its name.
         about: one or two sentences for a newcomer.
-        reference: what the normalised return of 1 stands for.
-        exact: whether that is the exact optimum.
-        steps_limit: environment steps for learning; None for the comparison's own number.
-        change_goals: whether the change-of-goal experiment is run on it.
-        reward_given: whether the agent may read the environment's reward function; it learns one otherwise.
-        episodes: reporting episodes are multiplied by this: where there are few states, many cost little.
+        reference: description of the normalised return 1.
+        exact: whether it is the exact optimum.
+        steps_limit: environment steps for learning; None for the number in the comparison's settings.
+        change_goals: whether the change-of-goal experiment is run.
+        reward_given: whether the agent may use the environment's reward function; otherwise it learns one.
+        episodes: factor of the number of evaluation episodes, which are cheap with few states.
     """
 
     key: str
@@ -43,7 +43,7 @@ class Case:
 
     @property
     def title(self) -> str:
-        """What the report calls it."""
+        """Title in the report."""
         return self.world.name
 
     def make_env(self, **more: Any) -> gym.Env[Any, Any]:
@@ -52,7 +52,7 @@ class Case:
 
     @property
     def game(self) -> Game | None:
-        """The game as pure functions, or None when it is not one of this repository's games."""
+        """The game as pure functions, or None if it is not one of this repository's games."""
         return game_of(self.world)
 
     def steps(self, default: int) -> int:
@@ -71,7 +71,7 @@ CASES: tuple[Case, ...] = (
         "geyser_deterministic",
         find_world("GeyserRunner, deterministic"),
         _GEYSER_TEXT.format(cost=2)
-        + "The eruptions follow a fixed pattern: the best player runs right and steps aside just in time.",
+        + "The eruptions follow a fixed pattern: the best player runs right and moves aside just in time.",
         _OPTIMUM,
         change_goals=True,
         episodes=5,
@@ -96,8 +96,8 @@ CASES: tuple[Case, ...] = (
     Case(
         "maneuverer",
         find_world("Maneuverer"),
-        "A player walks round walls to a target; each time it arrives, walls and target are drawn anew "
-        "around it, so that almost every layout is one it has never seen. One point for each target.",
+        "A player walks around walls to a target; each time it arrives, new walls and a new target are drawn "
+        "at random, so that almost every layout is new. One point for each target.",
         "shortest paths",
         exact=False,
         change_goals=True,
@@ -105,17 +105,17 @@ CASES: tuple[Case, ...] = (
     Case(
         "flier_catcher",
         find_world("FlierCatcher"),
-        "Fliers come in from the right, one column a step, at random rows; the player moves up and down in "
+        "Fliers enter from the right at random rows and move one column per step; the player moves up and down in "
         "the first column and earns a point for each flier it catches.",
-        "dynamic programming over the visible fliers, strong but not proved optimal",
+        "dynamic programming over the visible fliers, strong but not proven optimal",
         exact=False,
         change_goals=True,
     ),
     Case(
         "frozen_lake",
         find_world("FrozenLake 4x4"),
-        "Gymnasium's slippery lake: the agent is told neither the reward nor when an episode ends and learns "
-        "both. One point for the goal, holes end the episode.",
+        "Gymnasium's slippery lake: the agent is given neither the reward nor the rules of termination and "
+        "learns both. One point for the goal; holes end the episode.",
         "the exact optimum, by dynamic programming over 100 steps",
         steps_limit=20_000,
         reward_given=False,
@@ -129,7 +129,7 @@ def find_case(key: str) -> Case:
     """The case called ``key``.
 
     Raises:
-        ValueError: there is none; the message lists those there are.
+        ValueError: there is none; the message lists the known names.
     """
     return find("case", key, {case.key: case for case in CASES})
 
@@ -151,7 +151,7 @@ def play(
     repeatable: bool = False,
     report: Callable[[float], None] | None = None,
 ) -> Evaluation:
-    """Plays reporting episodes of a case and scores them for the goals named; see ``evaluate_game``."""
+    """Plays evaluation episodes of a case and scores them for the given goals; see ``evaluate_game``."""
     game = case.game
     if game is None:
         return evaluate_env(case.make_env, policy, episodes=episodes, seed=seed, repeatable=repeatable)

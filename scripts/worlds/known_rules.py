@@ -1,4 +1,4 @@
-"""What is known of worlds: their rules as tables or as models, and the scales of their returns."""
+"""Known rules of worlds, as tables or models, and the scales of their returns."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from worlds.registry import World, find_world
 from worlds.snapshots import SnapshotModel
 
 RANDOM_EPISODES = 300
-"""Episodes that random play is measured with, where it is neither computed nor that of a game."""
+"""Number of episodes of random play for the scale of worlds that are neither games nor known as tables."""
 
 
 @cache
@@ -31,7 +31,7 @@ def tables_of(target: str) -> RddlTables:
 
 
 def exact_world(world: World) -> FiniteHorizonMDP | None:
-    """A world as tables; None where its rules are not at hand."""
+    """A world as tables; None if its rules are not available."""
     if world.kind in ("toy_text", "planes"):
         return toy_text_mdp(world.make())
     return _exact_rddl(world.target) if world.kind == "rddl" else None
@@ -43,7 +43,7 @@ def _exact_rddl(target: str) -> FiniteHorizonMDP:
 
 
 def true_model(world: World) -> tuple[TransitionModel, RewardFn] | None:
-    """A world's rules and reward, as the planner takes them; None where they are not at hand."""
+    """A world's rules and reward for the planner; None if they are not available."""
     if world.kind == "toy_text":
         return toy_text_model(world.make())
     if world.kind == "game":
@@ -65,7 +65,7 @@ def _snapshots(name: str) -> SnapshotModel:
 
 
 def game_of(world: World) -> Game | None:
-    """A game as pure functions; None where the world is not one of this repository's games."""
+    """A game as pure functions; None if the world is not one of this repository's games."""
     env = world.make()
     game = getattr(env.unwrapped, "game", None)
     env.close()
@@ -74,11 +74,11 @@ def game_of(world: World) -> Game | None:
 
 @dataclass(frozen=True)
 class Scale:
-    """Where 0 and 1 lie on a world's scale of normalised returns.
+    """Scale of a world's normalised returns: the returns that correspond to 0 and 1.
 
     Attributes:
         random: mean return of uniformly random play.
-        reference: mean return of the reference; NaN when the goal has none.
+        reference: mean return of the reference; NaN if the goal has none.
     """
 
     random: float
@@ -86,13 +86,13 @@ class Scale:
 
 
 def scale_of(world: World, goal: str = "default", episodes: int = 1000) -> Scale:
-    """Where 0 and 1 lie: exact where a world is known as tables, else measured.
+    """The scale of a world: exact if it is known as tables, else measured.
 
     Args:
-        world: which.
+        world: the world.
         goal: name of a game's goal.
-        episodes: of a game's reference player; random play, which is quick and varies most, plays ten times as many. Without a
-            reference the best return is not known.
+        episodes: episodes of a game's reference player; random play, which is fast and varies most, plays ten times as many.
+            Without a reference the best return is not known.
     """
     known = exact_world(world)
     if known is not None:
@@ -107,7 +107,7 @@ def scale_of(world: World, goal: str = "default", episodes: int = 1000) -> Scale
 
 
 def _scale_of_game(game: Game, goal: str, episodes: int) -> Scale:
-    seed = 1_000_000  # not the episodes that the agents are scored on
+    seed = 1_000_000  # separate from the agents' evaluation episodes
     goals = {goal: {"default": game.reward, **game.reward_functions}[goal]}
 
     def mean(policy: Policy, n: int, *, repeatable: bool = False) -> float:

@@ -1,4 +1,4 @@
-"""MinAtar's next frames (Young and Tian 2019), with and without a history, beside the ceiling that sticky actions set."""
+"""Prediction of MinAtar's next frames (Young and Tian 2019), with and without a history, and the limit set by sticky actions."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from mbagent.spaces import FactoredSpace
 from mbagent.wrappers import History
 
 GAMES = {"breakout": 1, "freeway": 5, "asterix": 1}
-"""Games and how many steps back a history shows."""
+"""Games, with the number of earlier steps in a history."""
 
 AT_ONCE = 1000
-"""Steps that are kept as wide integers at once."""
+"""Number of steps that are stored as wide integers at once."""
 
 LONGEST = 500
-"""Steps of an episode."""
+"""Number of steps of an episode."""
 
 
 class Frames(gym.Env[NDArray[np.int8], Any]):
@@ -31,12 +31,12 @@ class Frames(gym.Env[NDArray[np.int8], Any]):
 
     Args:
         name: the game.
-        sticky: probability that an action is the one before, whatever was chosen.
+        sticky: probability that the previous action replaces the chosen one.
 
     Attributes:
-        same: whether the last frame would have come without sticky actions, too.
+        same: whether the last frame would be the same without sticky actions.
         n_channels: number of planes.
-        n_actions: number of actions that do anything.
+        n_actions: number of actions with an effect.
     """
 
     def __init__(self, name: str, sticky: float) -> None:
@@ -76,7 +76,7 @@ class Frames(gym.Env[NDArray[np.int8], Any]):
 
 
 def frames(name: str, sticky: float, k: int, n_steps: int, seed: int) -> tuple[FactoredSpace, TransitionDataset, float]:
-    """Random play: the space, the transitions, and the share of frames that sticky actions left as they were meant."""
+    """Random play: the space, the transitions, and the share of frames not changed by sticky actions."""
     inner = Frames(name, sticky)
     env: gym.Env[Any, Any] = History(inner, k) if k else inner
     space, n_actions = FactoredSpace(env.observation_space), inner.n_actions
@@ -110,16 +110,16 @@ class Variant(NamedTuple):
 
 
 def variants(full: bool) -> list[Variant]:
-    """What is measured one after another; Freeway takes minutes and is left to ``full``."""
+    """The measured variants; Freeway takes minutes and is measured only with ``full``."""
     names = [name for name in GAMES if full or name != "freeway"]
     return [Variant(name, sticky, k) for name in names for sticky in (0.0, 0.1) for k in (0, GAMES[name])]
 
 
 def minatar(seed: int, full: bool, variant: Variant | None = None) -> list[Row]:
-    """Share of frames of new episodes that are foretold exactly, after 50,000 steps.
+    """Share of frames of new episodes that are predicted exactly, after 50,000 steps.
 
-    Freeway with a history of five steps has 5,700 factors, and a fit takes minutes. Five steps are what its slowest cars take;
-    the chicken's timer at the lower border could be told in about 99% of frames: steps down that lead nowhere set it unseen.
+    Freeway with a history of five steps has 5,700 factors, and a fit takes minutes. Its slowest cars move every five steps. The
+    chicken's timer at the lower border can be inferred in about 99% of frames: blocked steps down set it invisibly.
     """
     if variant is None:
         return [row for each in variants(full) for row in minatar(seed, full, each)]

@@ -1,4 +1,4 @@
-"""Games whose rules change while they are learned: other geysers, fliers from the other side, a mirrored control."""
+"""Games whose rules change during learning: other geysers, fliers from the other side, a mirrored control."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from mbagent_envs.types import Bits, Keys
 
 
 class Relabelled(Game):
-    """A game with its bits and actions renamed, so that the same states follow other rules.
+    """A game with permuted bits and actions, so that the same states follow different rules.
 
     Args:
         game: the game.
-        bits: which bit of the game each bit stands for.
-        actions: which action of the game each action stands for.
+        bits: index of the game's bit for each bit.
+        actions: index of the game's action for each action.
     """
 
     def __init__(self, game: Game, bits: Sequence[int] | None = None, actions: Sequence[int] | None = None) -> None:
@@ -46,7 +46,7 @@ class Relabelled(Game):
         return self._renamed(following, self._bits)
 
     def reward(self, obs: npt.NDArray[Any], actions: npt.NDArray[Any], next_obs: npt.NDArray[Any]) -> Floats:
-        """Nothing: nobody plays it."""
+        """Zero, since the game is not played."""
         return np.zeros(len(obs))
 
     def scene(self, obs: Bits) -> Scene:
@@ -74,7 +74,7 @@ def other_fliers() -> tuple[Game, Game]:
 
 
 def mirrored_control() -> tuple[Game, Game]:
-    """Up is down and left is right."""
+    """Up and down, and left and right, are exchanged."""
     game = Maneuverer()
     return game, Relabelled(game, actions=[2, 3, 0, 1])
 

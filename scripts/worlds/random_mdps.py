@@ -1,4 +1,4 @@
-"""Small random worlds as tables, with everything known exactly: what searches are compared on."""
+"""Small random MDPs as tables with exact values, for the comparison of searches."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ N_STATES, N_ACTIONS, N_SUCCESSORS = 25, 4, 3
 GAMMA = 0.95
 
 LEAF_NOISE = 1.0
-"""Standard deviation of the leaf values' error, in standard deviations of the exact values over a world's states."""
+"""Standard deviation of the leaf values' error, in standard deviations of the exact values over the states."""
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,13 @@ class RandomMDP:
     """A Markov decision process with S states, A actions and at most K successors of each (state, action).
 
     Attributes:
-        successors: int64 [S, A, K].
-        probabilities: of them, float64 [S, A, K], summing to one.
+        successors: next states, int64 [S, A, K].
+        probabilities: their probabilities, float64 [S, A, K], which sum to one.
         rewards: on arrival in each state, float64 [S].
         ends: whether arrival there terminates, bool [S].
-        leaf_values: crude values of the states, what every search is given alike, float64 [S]; 0 where it is terminated.
-        q: exact values of the actions, float64 [S, A].
-        gamma: discount of a step.
+        leaf_values: approximate state values, the same for all searches, float64 [S]; 0 for terminated states.
+        q: exact action values, float64 [S, A].
+        gamma: discount factor.
     """
 
     successors: Ints
@@ -46,7 +46,7 @@ class RandomMDP:
 
     @property
     def table(self) -> Floats:
-        """P(next state | state, action) in full: float64 [S, A, S]."""
+        """Full table of P(next state | state, action), float64 [S, A, S]."""
         n, n_actions, _ = self.successors.shape
         table = np.zeros((n, n_actions, n))
         states, actions = np.ogrid[:n, :n_actions]
@@ -54,24 +54,24 @@ class RandomMDP:
         return table
 
     def regrets(self, roots: Ints, actions: Ints) -> Floats:
-        """What the actions taken at the roots lose, float64 [...]: the best action's exact value less theirs."""
+        """Regrets of the actions at the roots, float64 [...]: exact value of the best action minus theirs."""
         lost: Floats = self.q[roots].max(axis=-1) - self.q[roots, actions]
         return lost
 
     def random_regrets(self, roots: Ints) -> Floats:
-        """What an action drawn at random loses on average at each root."""
+        """Mean regret of a random action at each root."""
         lost: Floats = self.q[roots].max(axis=-1) - self.q[roots].mean(axis=-1)
         return lost
 
 
 def random_mdp(kind: Kind, seed: int, n_states: int = N_STATES) -> RandomMDP:
-    """A world of random transitions.
+    """An MDP with random transitions.
 
     Args:
-        kind: "dense": a standard normal reward in every state, and a tenth of the states terminates; "sparse": one state
-            in eight pays 1 and terminates, one in eight terminates and pays nothing, the others pay nothing.
-        seed: which world.
-        n_states: S.
+        kind: "dense": a standard normal reward in every state, and a tenth of the states terminate; "sparse": one state
+            in eight has reward 1 and terminates, one in eight terminates with reward 0, the others have reward 0.
+        seed: seed of the MDP.
+        n_states: number of states S.
     """
     rng = np.random.default_rng([seed, ("dense", "sparse").index(kind)])
     shape = (n_states, N_ACTIONS)
@@ -93,7 +93,7 @@ def random_mdp(kind: Kind, seed: int, n_states: int = N_STATES) -> RandomMDP:
 
 
 def side_by_side(worlds: Sequence[RandomMDP]) -> RandomMDP:
-    """Several worlds of equal K, A and gamma as one whose parts do not touch: state s of world w becomes w * S + s."""
+    """Combines MDPs of equal K, A and gamma into one with disconnected parts: state s of MDP w becomes w * S + s."""
     offsets = np.cumsum([0, *(len(world.rewards) for world in worlds[:-1])])
     return RandomMDP(
         np.concatenate([world.successors + offset for world, offset in zip(worlds, offsets, strict=True)]),
@@ -107,13 +107,13 @@ def side_by_side(worlds: Sequence[RandomMDP]) -> RandomMDP:
 
 
 def choose_roots(world: RandomMDP, n: int, seed: int) -> Ints:
-    """Distinct states int64 [n] to plan from, in which it matters what is done: not terminated, actions not all alike."""
+    """Distinct root states int64 [n], not terminated and with action values that are not all equal."""
     matters = np.flatnonzero(~world.ends & (np.ptp(world.q, axis=1) > 1e-9))
     return np.sort(np.random.default_rng(seed).permutation(matters)[:n]).astype(np.int64)
 
 
 def save_mdp(path: Path, world: RandomMDP, **further: NDArray[np.generic]) -> None:
-    """Writes a world and further arrays as .npz, in the form that the scripts in ``scripts/peers`` read."""
+    """Writes an MDP and further arrays as .npz, in the format read by the scripts in ``scripts/peers``."""
     names = ("successors", "probabilities", "rewards", "ends", "leaf_values", "gamma")
     arrays = {name: np.asarray(getattr(world, name)) for name in names}
     np.savez(path, allow_pickle=False, **arrays, **further)

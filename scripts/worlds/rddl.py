@@ -19,20 +19,20 @@ from mbagent.types import Actions, Bools, Floats, Randomness, States
 from mbagent_envs.random_keys import uniforms
 
 MAX_STATES = 20_000
-"""Larger worlds are not tabulated."""
+"""Larger domains are not tabulated."""
 
 _LISTED = 6
-"""Bits whose values together are listed; where more are uncertain, states are drawn."""
+"""Largest number of uncertain bits whose joint values are listed; with more, states are sampled."""
 
 
 @dataclass(frozen=True)
 class RddlTables:
-    """A domain's reachable states, and what each action does in them.
+    """A domain's reachable states, and the effects of each action in them.
 
     Attributes:
-        states: int64 [S, F], the first is the start.
-        chances: probability that each bit is on next, float64 [S, A, F].
-        rewards: float64 [S, A].
+        states: states int64 [S, F]; the first is the start state.
+        chances: probability that each bit is on in the next state, float64 [S, A, F].
+        rewards: rewards, float64 [S, A].
     """
 
     states: States
@@ -40,7 +40,7 @@ class RddlTables:
     rewards: Floats
 
     def rows_of(self, states: States) -> NDArray[np.int64]:
-        """Which of the reachable states each is [B]; -1 for others."""
+        """Index of each state [B] among the reachable states; -1 for others."""
         weights = 1 << np.arange(self.states.shape[1], dtype=np.int64)
         own = self.states @ weights
         order = np.argsort(own)
@@ -67,8 +67,9 @@ class RddlTables:
 def rddl_tables(env: RddlEnv) -> RddlTables:
     """Tabulates a domain of binary fluents.
 
-    Each Bernoulli is evaluated to its probability instead of a draw, so that one evaluation of the rules gives all next
-    fluents' exact probabilities. That holds where next fluents are independent given state and action, and rewards hang on these.
+    Each Bernoulli variable is evaluated to its probability instead of a sample, so that one evaluation of the rules gives the
+    exact probabilities of all next fluents. This holds if next fluents are independent given state and action, on which
+    rewards must depend.
 
     Raises:
         NotImplementedError: the domain is of another kind.
@@ -96,7 +97,7 @@ def rddl_tables(env: RddlEnv) -> RddlTables:
 
 
 def _outcomes(chances: Floats) -> States:
-    """All next states that are possible, int64 [K, F]."""
+    """All possible next states, int64 [K, F]."""
     open_bits = np.flatnonzero((chances > 0) & (chances < 1))
     values = np.array(list(product((0, 1), repeat=len(open_bits))), dtype=np.int64).reshape(2 ** len(open_bits), len(open_bits))
     states = np.tile((chances >= 1).astype(np.int64), (len(values), 1))
@@ -111,7 +112,7 @@ class _Rules:
         from pyRDDLGym.core.simulator import RDDLSimulator  # noqa: PLC0415 - an optional dependency
 
         class Chances(RDDLSimulator):  # type: ignore[misc]
-            """A simulator whose draws are probabilities."""
+            """A simulator that evaluates random variables to their probabilities."""
 
             def _sample_bernoulli(self, expr: Any, subs: Any) -> Any:
                 return self._sample(expr.args[0], subs)
@@ -125,7 +126,7 @@ class _Rules:
         self.start = np.array([int(observation[name]) for name in env.fluents], dtype=np.int64)
 
     def evaluate(self, state: States, assignment: dict[str, Any]) -> tuple[Floats, float]:
-        """Probability [F] that each fluent is on next, and the reward."""
+        """Probability [F] that each fluent is on in the next state, and the reward."""
         sampler, model = self.rddl.sampler, self.rddl.model
         values = dict(zip(self.fluents, state.astype(bool).tolist(), strict=True))
         subs = sampler.subs
@@ -144,7 +145,7 @@ class _Rules:
 
 
 class RddlModel(ExactModel):
-    """A tabulated domain behind the models' protocol.
+    """A tabulated domain with the models' protocol.
 
     Args:
         tables: the domain.
@@ -165,8 +166,8 @@ class RddlModel(ExactModel):
 
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
         """See TransitionModel."""
-        luck = uniforms(as_keys(rng, len(states)), states.shape[1])
-        return (luck < self._chances(states, actions)).astype(np.int64), np.zeros(len(states), dtype=np.bool_)
+        noise = uniforms(as_keys(rng, len(states)), states.shape[1])
+        return (noise < self._chances(states, actions)).astype(np.int64), np.zeros(len(states), dtype=np.bool_)
 
     def marginals(self, states: States, actions: Actions) -> Floats:
         """See TransitionModel."""
@@ -174,7 +175,7 @@ class RddlModel(ExactModel):
         return np.stack((1.0 - chances, chances), axis=2).reshape(len(states), -1)
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
-        """See TransitionModel; all of them where few bits are uncertain."""
+        """See TransitionModel; complete if few bits are uncertain."""
         chances = self._chances(states, actions)
         if (((chances > 0) & (chances < 1)).sum(axis=1) > _LISTED).any():
             return super().successors(states, actions, n_samples, seed)

@@ -25,15 +25,15 @@ class World:
     """One environment.
 
     Attributes:
-        name: what the results call it.
-        kind: which package it is from, or is like; "game" for this repository's, "binned" for continuous ones, cut into bins,
-            "planes" for tables of which planes are seen.
+        name: name in the results.
+        kind: the package it is from or resembles; "game" for this repository's games, "binned" for discretised continuous
+            environments, "planes" for tabular MDPs observed as planes.
         target: id for ``gym.make``, or name of an RDDL domain or of a game.
         kwargs: further arguments.
         steps: environment steps for learning.
-        bins: of each dimension, where it is binned.
-        bounds: what each dimension is clipped at first; nothing to leave them as they are.
-        settings: of the agent, where they are not its defaults.
+        bins: number of bins of each dimension, if it is binned.
+        bounds: bounds to which each dimension is clipped first; empty for no clipping.
+        settings: settings of the agent that differ from its defaults.
     """
 
     name: str
@@ -52,7 +52,7 @@ class World:
         return self.kind if any(importlib.util.find_spec(name) is None for name in needed) else None
 
     def make(self, **more: Any) -> gym.Env[Any, Any]:
-        """A new copy, with further arguments, which take the place of its own."""
+        """A new copy, with further arguments that override its own."""
         kwargs = {**self.kwargs, **more}
         if self.kind == "rddl":
             return RddlEnv(self.target, **kwargs)
@@ -67,7 +67,7 @@ class World:
         return DiscretizeObservation(env, self.bins, multidiscrete=True) if self.bins else env
 
     def make_for_networks(self) -> gym.Env[Any, Any]:
-        """A new copy as SB3's networks take it best: images of numbers as a row of small floats."""
+        """A new copy in the best form for SB3's networks: images of numbers as a row of small floats."""
         return for_networks(self.make())
 
 
@@ -86,7 +86,7 @@ WORLDS = (
     World("Inventory", "toy_text", "mbagent/Inventory-v0", steps=3000),
     World("DeepSea", "planes", "mbagent/DeepSea-v0", steps=3000),
 )
-"""The development set; the agent's defaults are the same for all."""
+"""The development set; the agent's settings are the same for all."""
 
 _GEYSER = "mbagent/GeyserRunner-v0"
 
@@ -112,30 +112,30 @@ ARCADE = (
     World("MinAtar Breakout", "minatar", "breakout", steps=100_000),
     World("MinAtar Asterix", "minatar", "asterix", steps=100_000),
 )
-"""Games of scripts/learning_curves.py, with sticky actions and ever more difficult; a history of one step."""
+"""Games of scripts/learning_curves.py, with sticky actions, increasing difficulty and a history of one step."""
 
 
 REGISTRY = {world.name: world for world in (*WORLDS, *CONTINUOUS, *ARCADE, *GAMES)}
-"""Every environment of the studies, by its name."""
+"""All environments of the studies, by name."""
 
 
 def find_world(name: str) -> World:
     """The world called ``name``.
 
     Raises:
-        ValueError: there is none; the message lists those there are.
+        ValueError: there is none; the message lists the known names.
     """
     return find("world", name, REGISTRY)
 
 
 def clipped(env: gym.Env[Any, Any], bounds: tuple[float, ...]) -> gym.Env[Any, Any]:
-    """The same world, each variable between its bound and minus that."""
+    """The same environment with each variable clipped to its bound and the negative of it."""
     high = np.array(bounds, dtype=np.float32)
     return TransformObservation(env, lambda obs: np.clip(obs, -high, high), gym.spaces.Box(-high, high))
 
 
 def for_networks(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
-    """Images as a row of floats, a tenth of their numbers: SB3 would divide by 255, and show networks next to nothing."""
+    """Images as a row of floats, divided by 10: SB3 would divide by 255 and give the networks values close to 0."""
     space = env.observation_space
     if not isinstance(space, gym.spaces.Box):
         return env

@@ -1,4 +1,4 @@
-"""An environment as a model of itself, for worlds without tables of their rules: what its copies do from states that were met."""
+"""An environment as a model of itself, for worlds without tables of their rules: its copies are stepped from observed states."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from mbagent.spaces import ActionEnumeration, FactoredSpace
 from mbagent.types import Actions, Bools, Floats, Randomness, States
 
 DRAWS = 64
-"""Steps of copies that tell what follows a (state, action)."""
+"""Number of steps of copies from which the outcomes of a (state, action) are estimated."""
 
 STARTS = 64
-"""Episodes that are begun to find where episodes begin."""
+"""Number of resets for finding the start states."""
 
 Outcome = tuple[bytes, bool]
 
 
 class SnapshotModel(ExactModel):
-    """A world known by trying: of every state met there is a copy of the environment, and copies of that are stepped.
+    """Simulator model from a copy of the environment for each observed state, further copies of which are stepped.
 
-    Right for environments that can be copied, draw from ``np_random`` alone, and show all that matters. Limits of steps are
-    left out. Rewards are those of the first copy that met (state, action, next state).
+    Valid for environments that can be copied, use only ``np_random`` for random numbers, and are fully observed. Step limits
+    are ignored. Rewards are those of the first copy that observed (state, action, next state).
 
     Args:
         env: the environment; it is reset.
-        seed: of all draws.
+        seed: seed of all random numbers.
     """
 
     def __init__(self, env: gym.Env[Any, Any], seed: int = 0) -> None:
@@ -54,14 +54,14 @@ class SnapshotModel(ExactModel):
         return row.astype(np.int64).tobytes()
 
     def _outcomes(self, state: bytes, action: int) -> Mapping[Outcome, float]:
-        """Shares of what followed a (state, action).
+        """Observed shares of the outcomes of a (state, action).
 
         Raises:
-            ValueError: the state was never met.
+            ValueError: the state was never observed.
         """
         if (state, action) not in self._tables:
             if state not in self._copies:
-                raise ValueError("This state was never met: only what follows states met before is known.")
+                raise ValueError("This state was never observed: only outcomes of observed states are known.")
             found: dict[Outcome, float] = {}
             chosen = self._actions.decode(np.array([action]))[0]
             for draw in range(DRAWS):
@@ -77,11 +77,11 @@ class SnapshotModel(ExactModel):
         return self._tables[state, action]
 
     def start_states(self, n: int, seed: int = 0) -> States:
-        """Start states met, int64 [n or fewer, F]."""
+        """Observed start states, int64 [n or fewer, F]."""
         return np.stack([np.frombuffer(state, dtype=np.int64) for state in self._starts[:n]])
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
-        """See TransitionModel; all that was met, whatever ``n_samples`` is."""
+        """See TransitionModel; all observed outcomes, regardless of ``n_samples``."""
         tables = [self._outcomes(*pair) for pair in self._pairs(states, actions)]
         offsets = np.concatenate([[0], np.cumsum([len(table) for table in tables])]).astype(np.int64)
         rows = [(np.frombuffer(state, dtype=np.int64), over, p) for table in tables for (state, over), p in table.items()]
@@ -93,9 +93,9 @@ class SnapshotModel(ExactModel):
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
         """See TransitionModel."""
         found, keys = self.successors(states, actions, DRAWS, 0), as_keys(rng, len(states))
-        luck = np.array([np.random.default_rng(int(key)).random() for key in keys])
+        noise = np.array([np.random.default_rng(int(key)).random() for key in keys])
         cumulated = np.concatenate([[0.0], np.cumsum(found.probabilities)])
-        chosen = np.searchsorted(cumulated, cumulated[found.offsets[:-1]] + luck, side="right") - 1
+        chosen = np.searchsorted(cumulated, cumulated[found.offsets[:-1]] + noise, side="right") - 1
         chosen = np.clip(chosen, found.offsets[:-1], found.offsets[1:] - 1)
         return found.states[chosen], found.terminated[chosen]
 
@@ -119,7 +119,7 @@ class SnapshotModel(ExactModel):
         return result
 
     def reward(self, obs: Any, action: Any, next_obs: Any) -> Floats:
-        """Rewards met, [B]; 0 for what was never met."""
+        """Observed rewards [B]; 0 for transitions that were never observed."""
         states, following = (self._space.encode(np.asarray(part)).astype(np.int64) for part in (obs, next_obs))
         numbers = self._actions.encode(np.asarray(action))
         keys = zip(self._pairs(states, numbers), following, strict=True)

@@ -1,4 +1,4 @@
-"""A world of d bits of which only a few are ever open, and models trained on it: what samplers are timed on."""
+"""A synthetic DBN of d bits of which only a few are ever random, and models trained on it, for timing samplers."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from mbagent.types import Ints
 Sampler: TypeAlias = Literal["networks", "sweeps"]
 
 PAIRS_REDRAWN = (0, 1, 2, 4)
-"""Pairs of bits that each action draws anew: so 0, 2, 4 or 8 of the d bits are uncertain, 3.5 on average."""
+"""Number of pairs of bits that each action redraws: 0, 2, 4 or 8 of the d bits are uncertain, 3.5 on average."""
 
 AGREEMENT = 0.9
-"""How probably the second bit of a redrawn pair is the opposite of the first."""
+"""Probability that the second bit of a redrawn pair is the opposite of the first."""
 
 
 def following(states: Ints, actions: Ints, seed: int, rng: np.random.Generator) -> Ints:
-    """Next states int64 [B, d]: bits stay as they are, an action sets a quarter of them, and some pairs are redrawn.
+    """Next states int64 [B, d]: bits keep their values, except that an action sets a quarter of them, and some pairs are redrawn.
 
     Args:
-        states: int64 [B, d].
-        actions: int64 [B].
-        seed: which world: what each action sets, and which bits are pairs.
-        rng: luck.
+        states: states int64 [B, d].
+        actions: actions int64 [B].
+        seed: seed of the rules: the bits that each action sets, and the pairs.
+        rng: random generator of the transitions.
     """
     n, d = states.shape
     fixed = np.random.default_rng([seed, d])
@@ -57,7 +57,7 @@ def random_inputs(d: int, n: int, rng: np.random.Generator) -> tuple[Ints, Ints]
 
 
 def random_data(d: int, n: int, seed: int) -> TransitionDataset:
-    """Transitions from random states under random actions, ten to an episode."""
+    """Transitions from random states under random actions, ten per episode."""
     rng = np.random.default_rng([seed, d, 1])
     states, actions = random_inputs(d, n, rng)
     data = TransitionDataset((2,) * d, len(PAIRS_REDRAWN))
@@ -67,13 +67,13 @@ def random_data(d: int, n: int, seed: int) -> TransitionDataset:
 
 
 def build_sampler(sampler: Sampler, d: int, steps: int) -> NeuralTransitionModel:
-    """An untrained model of the world.
+    """An untrained model of the synthetic DBN.
 
     Args:
         sampler: "networks", as ``model="networks"`` builds it (causal conditioner); or "sweeps": predictor and conditioner
-            of the paper's sizes, 2d + 1 and 2d a group, a group for every variable, and the paper's sampling.
+            of the paper's sizes, 2d + 1 and 2d per group, one group per variable, and the paper's sampling.
         d: number of bits.
-        steps: of gradient descent; "sweeps" only.
+        steps: steps of gradient descent; "sweeps" only.
     """
     n_actions = len(PAIRS_REDRAWN)
     if sampler == "networks":
@@ -83,7 +83,7 @@ def build_sampler(sampler: Sampler, d: int, steps: int) -> NeuralTransitionModel
     training = TrainingConfig(
         learning_rate=0.01, weight_decay=0.0, batch_size=4096 // d, min_steps=steps, max_steps=steps, checks=2, negligible=-1.0
     )
-    # Sizes, masks and procedure are the paper's; the rest is what makes networks trustworthy in few steps.
+    # Sizes, masks and procedure are the paper's; the other settings make the networks accurate in few steps.
     config = replace(
         NeuralConfig.paper(d), activation="relu", residual=True, correction=True, certain=1.1, sweeps=1, training=training
     )
@@ -94,10 +94,10 @@ def trained(sampler: Sampler, d: int, seed: int, steps: tuple[int, int] = (3000,
     """A model fitted to random transitions.
 
     Args:
-        sampler: see ``build_sampler``; "networks" is fitted as always.
+        sampler: see ``build_sampler``; "networks" is fitted with its defaults.
         d: number of bits.
-        seed: of data and fit.
-        steps: of gradient descent in the predictor and in the conditioner of "sweeps": a step of the conditioner, which has
+        seed: seed of data and fit.
+        steps: steps of gradient descent in the predictor and in the conditioner of "sweeps": a step of the conditioner, which has
             d groups as large as the predictor, costs d times as much.
     """
     model, data = build_sampler(sampler, d, steps[1]), random_data(d, 6000, seed)

@@ -1,7 +1,7 @@
-"""Worlds made up here that ask what Gymnasium's own do not, as tables in the layout of toy_text; importing registers them.
+"""Toy MDPs for properties that Gymnasium's own do not test, as tables in the layout of toy_text; importing registers them.
 
-``mbagent/Inventory-v0``: numbers that add up, with luck, between bounds. ``mbagent/DeepSea-v0`` (Osband et al. 2020, Behaviour
-suite for reinforcement learning): a plane of bits, where what actions do hangs on the place.
+``mbagent/Inventory-v0``: random sums, clipped to bounds. ``mbagent/DeepSea-v0`` (Osband et al. 2020, Behaviour
+suite for reinforcement learning): a plane of bits, where the effects of actions depend on the position.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from numpy.typing import NDArray
 from scipy import stats
 
 Outcome = tuple[float, int, float, bool]
-"""Probability, next state, reward, whether the episode ends."""
+"""Probability, next state, reward, whether the episode terminates."""
 
 
 class TableEnv(gym.Env[Any, Any]):
-    """A world by its table.
+    """An MDP given by its table.
 
     Args:
         table: outcomes of each action in each state, ``table[state][action]``.
-        start: the state in which all episodes begin.
-        observations: what is seen of each state, [S, ...].
-        space: of what is seen.
+        start: the start state of all episodes.
+        observations: observation of each state, [S, ...].
+        space: observation space.
 
     Attributes:
-        P: the table, as toy_text calls it.
-        initial_state_distrib: probability of each state that an episode begins there, float64 [S].
+        P: the table, with the name used in toy_text.
+        initial_state_distrib: probability of each state as start state, float64 [S].
     """
 
     def __init__(self, table: list[list[list[Outcome]]], start: int, observations: NDArray[Any], space: gym.Space[Any]) -> None:
@@ -50,20 +50,20 @@ class TableEnv(gym.Env[Any, Any]):
         return self._seen(), reward, over, False, {}
 
     def _seen(self) -> Any:
-        """A copy, or a number."""
+        """The current observation, as a copy or a number."""
         return self.observations[[self.state]][0]
 
 
 def inventory(capacity: int = 20, most: int = 10, demand: float = 4.0, start: int = 5) -> TableEnv:
-    """A shop: orders come before the day's customers do, and what there is no room for is lost.
+    """A shop: orders arrive before the day's customers, and items beyond the capacity are lost.
 
     Args:
-        capacity: what there is room for.
-        most: the largest order.
-        demand: mean of a day's demand, which is Poisson.
-        start: the first stock.
+        capacity: largest stock.
+        most: largest order.
+        demand: mean of the daily demand, which has a Poisson distribution.
+        start: initial stock.
 
-    A sale brings 6, an ordered piece costs 1, and one left overnight 0.1. (A classic of the field, as in Szepesvari 2010,
+    A sale earns 6, an ordered item costs 1, and an item stored overnight 0.1. (A classic example, as in Szepesvari 2010,
     Algorithms for Reinforcement Learning, example 1.)
     """
     table: list[list[list[Outcome]]] = []
@@ -83,26 +83,26 @@ def inventory(capacity: int = 20, most: int = 10, demand: float = 4.0, start: in
 
 
 def deep_sea(size: int = 10, slip: float = 0.0, seed: int = 0) -> TableEnv:
-    """A diver sinks by one row a step, to the right or to the left; which action is which differs from cell to cell.
+    """A diver sinks by one row per step, to the right or to the left; which action is which differs between cells.
 
     Args:
         size: rows and columns.
-        slip: probability that a step goes the other way.
-        seed: of what is left and right in each cell.
+        slip: probability that a step goes in the other direction.
+        seed: seed of the meaning of the actions in each cell.
 
-    Each step to the right costs 0.01 / size, and the treasure in the last cell, where only steps to the right lead, brings 1.
-    After the last row nothing is seen any more.
+    Each step to the right costs 0.01 / size, and the treasure in the last cell, reached only by steps to the right, has reward
+    1. After the last row the observation is empty.
     """
     right, end = np.random.default_rng(seed).integers(2, size=(size, size)), size * size
     table: list[list[list[Outcome]]] = []
     for row, column in np.ndindex(size, size):
-        ways: list[tuple[int, float, bool]] = []
+        moves: list[tuple[int, float, bool]] = []
         for step in (-1, 1):
-            last, beside = row == size - 1, min(max(column + step, 0), size - 1)
+            last, neighbour = row == size - 1, min(max(column + step, 0), size - 1)
             found = last and column == size - 1 and step == 1
-            ways.append((end if last else (row + 1) * size + beside, found - (step == 1) * 0.01 / size, last))
+            moves.append((end if last else (row + 1) * size + neighbour, found - (step == 1) * 0.01 / size, last))
         chosen = [int(right[row, column] == action) for action in (0, 1)]
-        outcomes = [[(1.0 - slip, *ways[way])] + ([(slip, *ways[1 - way])] if slip else []) for way in chosen]
+        outcomes = [[(1.0 - slip, *moves[way])] + ([(slip, *moves[1 - way])] if slip else []) for way in chosen]
         table.append(outcomes)
     table.append([[(1.0, end, 0.0, True)]] * 2)
     planes = np.eye(end + 1, end, dtype=np.int8).reshape(-1, size, size)

@@ -50,7 +50,7 @@ def test_several_goals_are_scored_from_the_same_episodes() -> None:
 
 
 def test_batched_episodes_score_like_episodes_of_the_environment() -> None:
-    # Other episodes, so only the means can agree: the runner that always runs right earns 76.9 a time.
+    # Different episodes, so only the means can agree: a runner that always runs right has a mean return of 76.9.
     case = find_case("geyser_low_cost")
     batched = play(case, rightwards, episodes=200, seed=0).default
     single = evaluate_env(case.make_env, rightwards, episodes=40).default
@@ -59,7 +59,7 @@ def test_batched_episodes_score_like_episodes_of_the_environment() -> None:
 
 
 def test_nothing_is_earned_after_termination() -> None:
-    # FrozenLake pays at most once, and an episode ends there.
+    # FrozenLake has at most one reward, with which the episode ends.
     returns = play(find_case("frozen_lake"), random_policy(4), episodes=200, seed=0).default
     assert set(np.unique(returns)) <= {0.0, 1.0}
 

@@ -8,7 +8,7 @@ from mbagent.evaluation.figures import Line, Panel, draw_panels
 
 
 def shows(png: bytes, colour: str) -> bool:
-    """Whether a picture has pixels of nearly that colour: thin lines are blended with what is behind them."""
+    """Whether a picture has pixels of nearly that colour: thin lines are blended with the background."""
     pixels = np.asarray(mpl.image.imread(io.BytesIO(png), format="png"))[..., :3].reshape(-1, 3)
     return bool((np.abs(pixels - mpl.colors.to_rgb(colour)).max(axis=1) < 0.15).any())
 

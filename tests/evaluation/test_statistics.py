@@ -17,7 +17,7 @@ def test_a_reference_that_does_not_beat_random_play_is_refused(reference: float)
 def test_interquartile_mean_drops_a_quarter_at_each_end() -> None:
     assert interquartile_mean([-1000.0, 1.0, 3.0, 1000.0]) == 2.0
     assert interquartile_mean([-1000.0, 1.0, 2.0, 3.0, 1000.0]) == 2.0
-    assert interquartile_mean([1.0, 2.0, 6.0]) == 3.0  # too few to cut
+    assert interquartile_mean([1.0, 2.0, 6.0]) == 3.0  # too few to trim
     assert interquartile_mean(np.arange(24.0).reshape(2, 3, 4)).shape == (2, 3)
     with pytest.raises(ValueError, match="at least one value"):
         interquartile_mean([])
@@ -65,7 +65,7 @@ def test_a_ratio_compares_plain_means_and_resamples_both_sides_together() -> Non
     others = np.random.default_rng(2).normal(10.0, 3.0, size=(5, 20))
     half = ratio_interval(1.0 + (others - 1.0) / 2.0, others, zero=1.0)
     assert half.estimate == pytest.approx(0.5)
-    assert half.high - half.low < 1e-12  # the episodes' luck is shared, so it leaves no width
+    assert half.high - half.low < 1e-12  # both share the random numbers of the episodes, so the width is zero
     bad_run = others.copy()
     bad_run[0] = 1.0
     assert ratio_interval(bad_run, others, zero=1.0).estimate == pytest.approx((bad_run - 1).sum() / (others - 1).sum())

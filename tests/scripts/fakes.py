@@ -1,4 +1,4 @@
-"""Quick stand-ins for the agent and for the baselines' training."""
+"""Fast stand-ins for the agent and for the baselines' training."""
 
 from types import SimpleNamespace
 from typing import Any

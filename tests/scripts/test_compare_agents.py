@@ -13,10 +13,10 @@ TINY = [*CASE, "--steps", "600", "--seeds", "1", "--episodes", "2", "--workers",
 
 
 def test_help_documents_every_option() -> None:
-    told = subprocess.run([sys.executable, SCRIPT, "--help"], capture_output=True, text=True, check=True).stdout
+    printed = subprocess.run([sys.executable, SCRIPT, "--help"], capture_output=True, text=True, check=True).stdout
     for name in Args.__dataclass_fields__:
-        assert "--" + name.replace("_", "-") in told
-    assert "ten times the steps" in " ".join(told.split())
+        assert "--" + name.replace("_", "-") in printed
+    assert "ten times the steps" in " ".join(printed.split())
 
 
 def test_the_script_writes_report_and_table_and_can_write_the_report_again(
@@ -42,8 +42,8 @@ def test_mistakes_get_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "run the comparison first" in capsys.readouterr().out
     for wrong in (["--seeds", "0"], ["--episodes", "-1"], ["--baselines", "SAC"], ["--workers", "0"]):
         assert main([*CASE, "--output", str(tmp_path), *wrong]) == 1
-        told = capsys.readouterr().out
-        assert "at least 1" in told or "choose from PPO, DQN, A2C" in told
+        printed = capsys.readouterr().out
+        assert "at least 1" in printed or "choose from PPO, DQN, A2C" in printed
     assert not (tmp_path / "records").exists()
 
 
@@ -59,7 +59,7 @@ def test_a_new_run_deletes_nothing_but_what_an_earlier_one_wrote(
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "Learning curves" not in page  # an empty figure would be worse than none
     assert "Stable-Baselines3 use" not in page
-    # Other options do not matter to a page written again: it is that run's.
+    # A rewritten page ignores other options: it uses the settings of that run.
     assert main(["--report-only", "--output", str(tmp_path)]) == 0
     capsys.readouterr()
 

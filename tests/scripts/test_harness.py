@@ -1,4 +1,4 @@
-"""What a study leaves on disk, and what is refused."""
+"""Files written by a study, and refused options."""
 
 import csv
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ class Args:
     """Options.
 
     Attributes:
-        output: where results go.
+        output: folder of the results.
         n: a number.
     """
 

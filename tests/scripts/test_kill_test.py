@@ -15,10 +15,10 @@ def test_writers_are_killed_and_nothing_is_lost(capsys: pytest.CaptureFixture[st
     monkeypatch.setattr(kill_test, "METHOD", "fork")  # the server would import everything first
     monkeypatch.setattr(os, "environ", {})  # which is changed for the server
     assert main(["--kills", "1", "--rows", "300", "--subjects", "folder", "save_transitions"]) == 0
-    told = capsys.readouterr().out
-    assert "folder through a link: 1 kills" in told
-    assert "save_transitions: two processes with 1 saves each" in told
-    assert "Nothing was lost." in told
+    output = capsys.readouterr().out
+    assert "folder through a link: 1 kills" in output
+    assert "save_transitions: two processes with 1 saves each" in output
+    assert "Nothing was lost." in output
 
 
 def test_losses_are_found(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,1 +1,1 @@
-"""Compares the agent with PPO, DQN and A2C on all games."""
+"""Comparison of the agent with PPO, DQN and A2C on all games."""

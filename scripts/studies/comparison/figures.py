@@ -27,16 +27,16 @@ COLOURS = {
     "A2C": "#3b7ea1",
     RANDOM: "#c9ced6",
 }
-"""One colour for each agent, in every picture."""
+"""Colour of each agent in all pictures."""
 
 
 def colour_of(agent: str) -> str:
-    """The colour of an agent, whatever follows its name after a comma."""
+    """The colour of an agent; any text after a comma in its name is ignored."""
     return COLOURS.get(agent) or next((colour for name, colour in COLOURS.items() if agent.startswith(name + ",")), "#555555")
 
 
 def draw_scores(results: Sequence[CaseResult]) -> bytes:
-    """Bars of the normalised return of every agent on every case, with their 95% intervals."""
+    """Bars of the normalised return of each agent on each case, with 95% intervals."""
     agents = [name for name in COLOURS if any(row.agent == name for result in results for row in result.rows)]
     agents = [name for name in agents if name != RANDOM]  # zero by definition
     with mpl.rc_context(FIGURE_STYLE):
@@ -66,13 +66,13 @@ def _draw_bar(axes: Axes, x: float, width: float, height: float, low: float, hig
 
 
 def _lines_of_the_scale(axes: Axes) -> None:
-    """Random play at 0 and the reference at 1."""
+    """Draws lines for random play at 0 and the reference at 1."""
     axes.axhline(0, color="#b8bfc8", linewidth=1)
     axes.axhline(1, color="#b8bfc8", linewidth=1, linestyle=(0, (4, 3)))
 
 
 def draw_curves(results: Sequence[CaseResult]) -> bytes:
-    """Normalised return against environment steps for each case; bands reach from worst to best seed."""
+    """Normalised return against environment steps for each case; bands extend from the worst to the best seed."""
     panels = []
     for number, result in enumerate(results):
         lines = [Line((), [0.0], "#b8bfc8"), Line((), [1.0], "#b8bfc8", style="--")]

@@ -1,4 +1,4 @@
-"""The pieces of work a comparison consists of; each runs alone in a process of its own."""
+"""The jobs of a comparison; each runs in a separate process."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ Report = Callable[[float], None]
 
 @dataclass(frozen=True)
 class Job:
-    """One piece of work.
+    """One job.
 
     Attributes:
         agent: name of the agent (one of the names in ``records``, or a baseline's).
         case: key of the case.
-        seed: training seed, and which reporting episodes.
+        seed: seed of training and of the evaluation episodes.
         steps: environment steps for learning.
-        episodes: reporting episodes.
+        episodes: evaluation episodes.
         goals: names of the goals to score.
-        goal_episodes: reporting episodes for each goal but the default one.
-        learn_reward: whether the agent is scored once more with a reward learned from those it met.
+        goal_episodes: evaluation episodes for each goal other than the default.
+        learn_reward: whether the agent is also scored with a reward learned from the observed rewards.
         curve: whether this is only a point of the agent's learning curve.
     """
 
@@ -74,10 +74,9 @@ class Job:
 
 
 class RewardOnly(gym.Env[Any, Any]):
-    """An environment without its reward function: rewards are only met, as in most environments.
+    """An environment without its reward function: rewards are only observed, as in most environments.
 
-    Not a ``gym.Wrapper`` on purpose: through a wrapper the inner environment's ``reward_fn`` would still be
-    found.
+    Deliberately not a ``gym.Wrapper``, through which the inner environment's ``reward_fn`` would still be found.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
@@ -96,7 +95,7 @@ class RewardOnly(gym.Env[Any, Any]):
 
 
 class _ReportSteps(BaseCallback):
-    """Tells how far the exploration has got."""
+    """Reports the progress of exploration."""
 
     def __init__(self, total: int, report: Report | None) -> None:
         super().__init__()
@@ -110,11 +109,11 @@ class _ReportSteps(BaseCallback):
 
 
 def run_job(job: Job, report: Report | None = None) -> list[Record]:
-    """Does a piece of work.
+    """Runs a job.
 
     Args:
-        job: what to do.
-        report: told the share done, 0 ... 1, now and then.
+        job: the job.
+        report: called regularly with the share done, 0 ... 1.
 
     Returns:
         One record for each goal.
@@ -149,13 +148,13 @@ def _play_fixed(job: Job, case: Case, policy: Policy) -> list[Record]:
 
 
 def _measure_scale(job: Job, case: Case, goal: str) -> Record:
-    """The reference's mean return, with that of random play beside it."""
+    """Mean returns of the reference and of random play."""
     scale = scale_of(case.world, goal, job.episodes)
     return _record(job, goal, np.array([scale.reference]), extra={"random": scale.random})
 
 
 def _typical_observations(case: Case, n: int = 24) -> NDArray[Any]:
-    """Observations [n, ...] from random play, for timing decisions."""
+    """Observations [n, ...] from random play, for the timing of decisions."""
     env = case.make_env()
     env.action_space.seed(0)
     rows = [env.reset(seed=0)[0]]
@@ -171,7 +170,7 @@ def _plan_on_true_model(job: Job, case: Case, report: Report | None) -> list[Rec
         return []
     agent = ModelLearningAgent("MctsPolicy", case.make_env(), model=SimulatorModel(game), seed=job.seed)
     if not agent.policy.fitted:
-        agent.learn(total_timesteps=1000)  # nothing is fitted: it only meets start states to plan from
+        agent.learn(total_timesteps=1000)  # nothing is fitted: this only records start states for planning
     return _score_goals(job, case, agent, 0.0, report)
 
 
@@ -191,10 +190,10 @@ def _learn_and_plan(job: Job, case: Case, report: Report | None) -> list[Record]
 
 
 def _learn_reward_too(job: Job, case: Case, agent: ModelLearningAgent, seconds: float) -> list[Record]:
-    """The same agent once more, with only the rewards it met while exploring to learn the goal from.
+    """Scores the same agent again with a goal learned only from the rewards observed during exploration.
 
-    Rewards never steer exploration and never touch the transition model, so learning anew without the reward
-    function would give the same model, byte for byte.
+    Neither exploration nor the transition model depends on rewards, so learning again without the reward function
+    would give the same model, byte for byte.
     """
     start = time.perf_counter()
     with _reward_warnings_ignored():
@@ -207,14 +206,14 @@ def _learn_reward_too(job: Job, case: Case, agent: ModelLearningAgent, seconds: 
 
 @contextmanager
 def _reward_warnings_ignored() -> Iterator[None]:
-    """The agent rightly warns that it has to learn the reward; here that is the experiment."""
+    """Suppresses the warning that the reward has to be learned, which is intended here."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*reward.*", category=UserWarning)
         yield
 
 
 def _score_goals(job: Job, case: Case, agent: ModelLearningAgent, seconds: float, report: Report | None) -> list[Record]:
-    """Gives the agent one goal after the other and plays each."""
+    """Gives the agent one goal after another and plays episodes for each."""
     game = case.game
     policy = as_policy(agent)
     learned = not isinstance(agent.model, SimulatorModel)
@@ -253,7 +252,7 @@ def _score_goals(job: Job, case: Case, agent: ModelLearningAgent, seconds: float
 
 
 def _part(report: Report, number: int, total: int) -> Report:
-    """A report about part ``number`` of ``total`` equal parts."""
+    """Report function for part ``number`` of ``total`` equal parts."""
     return lambda share: report((number + share) / total)
 
 
@@ -264,7 +263,7 @@ def _train_baseline(job: Job, case: Case, report: Report | None) -> list[Record]
     def evaluate(policy: Policy, repeatable: bool) -> float:
         nonlocal evaluating
         begin = time.perf_counter()
-        # Not the episodes reported on: these choose between the algorithm's two modes.
+        # Separate from the evaluation episodes: these choose between the algorithm's two modes.
         played = play(case, policy, episodes=50, seed=900_000 + job.seed, repeatable=repeatable)
         evaluating += time.perf_counter() - begin
         return float(played.default.mean())
@@ -290,5 +289,5 @@ def _train_baseline(job: Job, case: Case, report: Report | None) -> list[Record]
 
 
 def all_goals(case: Case) -> tuple[str, ...]:
-    """The goals a model-based agent is scored on for a case."""
+    """The goals on which a model-based agent is scored for a case."""
     return tuple(goals_of(case)) if case.change_goals else ("default",)

@@ -21,13 +21,13 @@ from worlds.games import Case
 
 
 def write_report(path: Path, results: Sequence[CaseResult], settings: Settings, *, command: str, minutes: float) -> None:
-    """Writes the page, pictures and all, into one file.
+    """Writes the page with embedded pictures into one file.
 
     Args:
         path: the file.
-        results: what ``summarise`` returned.
-        settings: those of the comparison.
-        command: the command line that makes this page again.
+        results: results of ``summarise``.
+        settings: settings of the comparison.
+        command: the command line that reproduces the page.
         minutes: wall time of the whole comparison.
     """
     page = render(
@@ -49,7 +49,7 @@ def write_report(path: Path, results: Sequence[CaseResult], settings: Settings, 
 
 
 def _picture(case: Case) -> bytes | None:
-    """A picture of the case; None where its drawing needs a package that is not installed."""
+    """A picture of the case; None if drawing it needs a package that is not installed."""
     try:
         return draw_game(case)
     except DependencyNotInstalled:
@@ -61,7 +61,7 @@ def _words(options: Mapping[str, Any]) -> str:
 
 
 def _headline(results: Sequence[CaseResult]) -> list[tuple[str, Interval]]:
-    """Each case with the score of the agent of this package, given the reward where it may have it."""
+    """Each case with the score of this package's agent, with the given reward if the case allows it."""
     found = []
     for result in results:
         for name in (AGENT, LEARNED_REWARD):

@@ -1,4 +1,4 @@
-"""The comparison: which agents learn what for how long, and how they score."""
+"""The plan of a comparison: agents, cases, numbers of steps and episodes."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ _COST = {"DQN": 4.0, "PPO": 2.0, "A2C": 1.5, AGENT: 6.0, LEARNED_REWARD: 3.0, TR
 
 @dataclass(frozen=True)
 class Settings:
-    """How thorough a comparison is.
+    """Size of a comparison.
 
     Attributes:
-        steps: environment steps for learning (fewer where a case says so).
+        steps: environment steps for learning (cases may use fewer).
         seeds: independent trainings of each learning agent.
-        episodes: reporting episodes for each training, multiplied by the case's own number.
+        episodes: evaluation episodes for each training, multiplied by a factor of the case.
         goal_episodes: the same for each new goal.
-        baseline_multiples: the baselines train for these multiples of the steps.
-        curve_steps: the agent is also trained afresh for so many steps, for its learning curve.
+        baseline_multiples: the baselines are trained for these multiples of the steps.
+        curve_steps: further agents are trained for these numbers of steps, as points of the learning curve.
         curve_seeds: trainings for each of these points.
-        goal_seeds: trainings on which new goals and the learned reward are tried.
-        scale_episodes: episodes from which random play and references are measured.
-        baselines: the agents to compare with.
+        goal_seeds: trainings that are evaluated on new goals and with the learned reward.
+        scale_episodes: episodes for measuring random play and references.
+        baselines: baselines to compare with.
         cases: keys of the cases.
     """
 
@@ -86,7 +86,7 @@ FULL = Settings(
 
 
 def plan_jobs(settings: Settings) -> list[Job]:
-    """All pieces of work, the longest first."""
+    """All jobs, longest first."""
     jobs: list[Job] = []
     for case in map(find_case, settings.cases):
         steps = case.steps(settings.steps)
@@ -121,17 +121,17 @@ def _jobs_of_seed(settings: Settings, case: Case, seed: int, steps: int) -> list
 
 
 def run(settings: Settings, folder: Path, *, workers: int, console: Console, resume: bool = False) -> list[Record]:
-    """Runs a comparison, keeping every job's records in ``folder / "records"`` as soon as it is done.
+    """Runs a comparison, saving each job's records in ``folder / "records"`` as soon as it is done.
 
     Args:
-        settings: how thorough.
-        folder: where results go.
+        settings: settings of the comparison.
+        folder: folder of the results.
         workers: number of processes.
-        console: where progress is shown.
-        resume: go on with an interrupted run instead of starting anew.
+        console: console for progress.
+        resume: continue an interrupted run instead of starting again.
 
     Raises:
-        ValueError: ``resume`` with other settings than those of the interrupted run, or no workers.
+        ValueError: ``resume`` with settings that differ from those of the interrupted run, or no workers.
         CellsFailedError: see ``run_recorded``.
     """
     if workers < 1:
@@ -140,7 +140,7 @@ def run(settings: Settings, folder: Path, *, workers: int, console: Console, res
     text = json.dumps(asdict(settings), indent=1)
     if resume and noted.exists() and noted.read_text(encoding="utf-8") != text:
         raise ValueError(f"The run kept in {kept} had other settings; give the same ones, or leave out --resume.")
-    if not resume:  # nothing but what an earlier run wrote
+    if not resume:  # delete only files of an earlier run
         for stale in [*kept.glob("*.json"), *kept.glob("*.progress"), *kept.glob("errors.log")]:
             stale.unlink()
     kept.mkdir(parents=True, exist_ok=True)
@@ -150,13 +150,13 @@ def run(settings: Settings, folder: Path, *, workers: int, console: Console, res
 
 
 def _mean(records: Sequence[Record]) -> str:
-    """What is shown of a job that is done."""
+    """Summary of a finished job for progress messages."""
     means = [record.mean for record in records if record.goal == "default"]
     return f", mean return {means[0]:.2f}" if means else ""
 
 
 def load(folder: Path) -> tuple[Settings, list[Record]]:
-    """The settings and the records kept by an earlier ``run``.
+    """The settings and records of an earlier ``run``.
 
     Raises:
         ValueError: there are none.

@@ -1,4 +1,4 @@
-"""What one training and its evaluation left behind, as plain data that survives a crash."""
+"""Results of one training and its evaluation, as plain data that survives a crash."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ class Record:
     Attributes:
         case: key of the case.
         agent: name of the agent.
-        goal: name of the reward function it was scored with.
+        goal: name of the reward function used for scoring.
         seed: training seed.
         steps: environment steps used for learning.
         returns: undiscounted return of each episode.
         learn_seconds: wall time of learning (exploring and fitting, or training), without evaluations.
-        decision_ms: median milliseconds for a decision about one observation; NaN when not measured.
-        curve: (environment steps, mean return) while learning; empty when there is none.
+        decision_ms: median milliseconds per decision for one observation; NaN if not measured.
+        curve: (environment steps, mean return) during learning; may be empty.
         weights_before: hash of the transition model's weights before the goal was given; empty without a
             model.
-        weights_after: the same after the goal was planned for.
-        curve_point: whether it was trained for fewer steps, only for a learning curve.
-        extra: further figures.
+        weights_after: the same after planning for the goal.
+        curve_point: whether the training was shorter and only gives a point of a learning curve.
+        extra: further results.
     """
 
     case: str
@@ -85,22 +85,22 @@ class Record:
 
 
 def write_records(path: Path, records: Sequence[Record]) -> None:
-    """Writes records as JSON, all or nothing."""
+    """Writes records as JSON, atomically."""
     files.write(path, json.dumps([asdict(record) for record in records]))
 
 
 def read_records(path: Path) -> list[Record]:
-    """Reads what ``write_records`` wrote."""
+    """Reads a file of ``write_records``."""
     rows = json.loads(path.read_text(encoding="utf-8"))
     return [Record(**{**row, "returns": tuple(row["returns"]), "curve": tuple((s, r) for s, r in row["curve"])}) for row in rows]
 
 
 def write_csv(path: Path, records: Sequence[Record], normalise: Mapping[tuple[str, str], tuple[float, float]]) -> None:
-    """Writes one line for each record.
+    """Writes one line per record.
 
     Args:
         path: the file.
-        records: what to write.
+        records: the records.
         normalise: (random, reference) mean returns by (case, goal).
     """
     file = io.StringIO()

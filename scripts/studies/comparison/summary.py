@@ -1,4 +1,4 @@
-"""From the records of single trainings to tables and learning curves."""
+"""Summary of the records of single trainings in tables and learning curves."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from worlds.known_rules import Scale
 
 @dataclass(frozen=True)
 class Row:
-    """One agent's line in a case's table, over all its seeds.
+    """One agent's row in the table of a case, over all its seeds.
 
     Attributes:
-        agent: its name, with the steps where they differ from the case's own.
+        agent: its name, with the steps if they differ from those of the case.
         steps: environment steps used for learning.
         score: interquartile mean of the normalised return, with its interval.
         mean_return: mean of the undiscounted return.
         learn_seconds: mean wall time of learning.
-        decision_ms: median milliseconds a decision.
+        decision_ms: median milliseconds per decision.
         seeds: number of trainings.
-        episodes: reporting episodes over all of them.
+        episodes: evaluation episodes over all of them.
     """
 
     agent: str
@@ -44,19 +44,19 @@ class Row:
 
 @dataclass(frozen=True)
 class GoalRow:
-    """One goal's line in the change-of-goal table.
+    """One goal's row in the change-of-goal table.
 
     Attributes:
         goal: its name.
         random: mean return of random play.
-        learned: mean return of the agent on its learned model.
-        true_model: the same planner's on the true model.
-        reference: the reference player's, NaN where there is none.
+        learned: mean return of the agent with its learned model.
+        true_model: mean return of the same planner with the true model.
+        reference: mean return of the reference player, NaN if there is none.
         ratio: (learned - random) / (true_model - random).
-        weights_unchanged: whether the model's weights are byte for byte those from before the goal was given.
-        weights: their hash, of the first seed.
+        weights_unchanged: whether the model's weights are byte for byte the same as before the goal was given.
+        weights: hash of the weights of the first seed.
         seeds: number of trainings.
-        episodes: reporting episodes over all of them.
+        episodes: evaluation episodes over all of them.
     """
 
     goal: str
@@ -73,14 +73,14 @@ class GoalRow:
 
 @dataclass(frozen=True)
 class CaseResult:
-    """Everything about a case.
+    """All results of a case.
 
     Attributes:
         case: the case.
-        scale: where 0 and 1 lie.
-        rows: its table, one line for each agent.
+        scale: returns that correspond to 0 and 1.
+        rows: its table, one row for each agent.
         curves: learning curves [(agent, [(steps, mean, lowest, highest normalised return)])].
-        goals: its change-of-goal table; empty where the experiment is not run.
+        goals: its change-of-goal table; empty if the experiment was not run.
     """
 
     case: Case
@@ -91,7 +91,7 @@ class CaseResult:
 
 
 def summarise(records: Sequence[Record], settings: Settings) -> list[CaseResult]:
-    """Turns records into tables and curves, case by case."""
+    """Summarises records in tables and curves, case by case."""
     results = []
     for case in map(find_case, settings.cases):
         mine = [r for r in records if r.case == case.key]
@@ -107,13 +107,13 @@ def _order() -> tuple[str, ...]:
 
 
 def _measured(records: Sequence[Record], goal: str) -> Scale:
-    """The scale that the comparison measured for a goal."""
+    """The scale measured by the comparison for a goal."""
     record = next(r for r in records if r.agent == REFERENCE and r.goal == goal)
     return Scale(record.extra["random"], record.mean)
 
 
 def _best_scale(case: Case, records: Sequence[Record], scale: Scale) -> Scale:
-    """Where the reference is no proven optimum, the planner on the true model replaces it if it is better."""
+    """If the reference is not a proven optimum, the planner on the true model replaces it if it is better."""
     planned = [r.mean for r in records if r.agent == TRUE_MODEL and r.goal == "default"]
     if case.exact or not planned:
         return scale
@@ -161,7 +161,7 @@ def _curves(records: Sequence[Record], scale: Scale) -> list[tuple[str, list[tup
             elif not r.curve and agent not in BASELINES:
                 points.setdefault(r.steps, []).append(r.mean)
         scaled = [(steps, normalised(means, scale.random, scale.reference)) for steps, means in sorted(points.items())]
-        if len(scaled) > 1:  # a single point is no curve
+        if len(scaled) > 1:  # a single point is not a curve
             curves.append((agent, [(s, float(v.mean()), float(v.min()), float(v.max())) for s, v in scaled]))
     return curves
 
@@ -193,7 +193,7 @@ def _goal_rows(case: Case, records: Sequence[Record]) -> list[GoalRow]:
 
 
 def _ratio(learned: Sequence[Record], true_model: Sequence[Record], random: float) -> Interval:
-    """(learned - random) / (true model - random), over the seeds that both have; the luck of an episode is the same for both."""
+    """(learned - random) / (true model - random), over the seeds of both; their episodes use the same random numbers."""
     against = {r.seed: r.returns for r in true_model}
     pairs = [(r.returns, against[r.seed]) for r in learned if r.seed in against]
     if not pairs or not np.mean([theirs for _, theirs in pairs]) > random:
@@ -208,7 +208,7 @@ def _final_all(records: Sequence[Record], agent: str, goal: str = "default") -> 
 
 
 def save_csv(path: Path, records: Sequence[Record], results: Sequence[CaseResult]) -> None:
-    """Writes ``results.csv``, a line for each record; new goals are scaled by the true model's planner."""
+    """Writes ``results.csv`` with a line for each record; new goals are normalised by the planner on the true model."""
     scales: dict[tuple[str, str], tuple[float, float]] = {}
     for result in results:
         scales[result.case.key, "default"] = (result.scale.random, result.scale.reference)

@@ -1,1 +1,1 @@
-"""How far ahead models can see (the paper's sections 2 and 4.2)."""
+"""Accuracy of forecasts several steps ahead (the paper's sections 2 and 4.2)."""

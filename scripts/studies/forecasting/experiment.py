@@ -1,4 +1,4 @@
-"""Learns each game by random play, forecasts 1 ... n steps in both ways, and compares with the game itself."""
+"""Learns each game by random play, forecasts 1 ... n steps with both methods, and compares with the game itself."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from studies.forecasting import measures as m
 from worlds.registry import World, find_world
 
 Method = Literal["iterated", "direct", "true again"]
-"""The one-step model iterated, models of n steps, and a second set of draws from the game: what chance alone gives."""
+"""The iterated one-step model, models of n steps, and a second set of samples from the game (error by chance alone)."""
 
 NAN = float("nan")
 
 MOST_LISTED = 300
-"""States up to which joint distributions are compared exactly."""
+"""Largest number of states for which joint distributions are compared exactly."""
 
 
 CASES = tuple(map(find_world, ("GeyserRunner, stochastic", "GeyserRunner, deterministic", "Maneuverer", "FlierCatcher")))
@@ -36,7 +36,7 @@ CASES = tuple(map(find_world, ("GeyserRunner, stochastic", "GeyserRunner, determ
 
 @dataclass(frozen=True)
 class Settings:
-    """What to run.
+    """Settings of the experiment.
 
     Attributes:
         cases: names of the games.
@@ -44,9 +44,9 @@ class Settings:
         timesteps: steps of random play to learn from.
         seeds: number of repetitions.
         first_seed: seed of the first.
-        n_starts: states to forecast from, met in random play that was not learned from.
-        n_draws: draws for each.
-        episodes: episodes played by flat Monte Carlo with either kind of forecasts; 0: none.
+        n_starts: start states of forecasts, from random play that was not used for learning.
+        n_draws: samples for each.
+        episodes: episodes played by flat Monte Carlo with each kind of forecast; 0 for none.
 
     Raises:
         ValueError: a setting is out of range.
@@ -84,11 +84,11 @@ class Score:
     """A method's error at n steps on one game with one seed.
 
     Attributes:
-        case, seed, method, n: which.
-        joint: total variation of the joint distribution, exact; NaN where states are too many.
-        inexact: share of draws that miss the only possible outcome; NaN where there hardly is one.
-        marginal: total variation of single factors, from draws.
-        fit_seconds: wall time of fitting the model used.
+        case, seed, method, n: identification.
+        joint: exact total variation of the joint distribution; NaN if there are too many states.
+        inexact: share of samples that differ from the only possible outcome; NaN if too few cases have only one.
+        marginal: total variation of single factors, from samples.
+        fit_seconds: wall time of the model's fit.
     """
 
     case: str
@@ -111,13 +111,13 @@ class Cell:
 
 
 def cells(settings: Settings) -> list[Cell]:
-    """All cells, those on planes first, since they take longest."""
+    """All cells; those on planes come first, since they take longest."""
     chosen = [case for case in reversed(CASES) if case.name in settings.cases]
     return [Cell(case, settings.first_seed + i, settings) for case in chosen for i in range(settings.seeds)]
 
 
 def run_cell(cell: Cell) -> Result[Cell]:
-    """Learns, forecasts, compares. Tables: "results", see ``Score``; "returns", mean returns with either kind of forecasts."""
+    """Learns, forecasts, compares. Tables: "results", see ``Score``; "returns", mean returns with each kind of forecast."""
     torch.set_num_threads(1)
     env, settings = cell.case.make(), cell.settings
     space, n_actions = FactoredSpace(env.observation_space), ActionEnumeration(env.action_space).n
@@ -163,7 +163,7 @@ def _compare(cell: Cell, true: SimulatorModel, model: DirectForecastModel, secon
 
 
 def _typical(true: SimulatorModel, n: int, seed: int) -> States:
-    """States int64 [n, F] met after 0 ... 49 steps of random play."""
+    """States int64 [n, F] after 0 ... 49 steps of random play."""
     keys = derive(seed, 1, np.arange(n))
     states, strings = true.start_states(n, seed=seed), random_strings(keys, 50, true.n_actions)
     for step in range(49):
@@ -173,7 +173,7 @@ def _typical(true: SimulatorModel, n: int, seed: int) -> States:
 
 
 def _draw(way: Any, starts: States, strings: Actions, n_draws: int, key: Keys) -> States:
-    """Draws int64 [cases, n_draws, F]."""
+    """Samples int64 [cases, n_draws, F]."""
     rows = np.repeat(np.arange(len(starts)), n_draws)
     states, _ = way(starts[rows], strings[rows], derive(key, np.arange(len(rows))))
     result: States = states.reshape(len(starts), n_draws, -1)
@@ -183,7 +183,7 @@ def _draw(way: Any, starts: States, strings: Actions, n_draws: int, key: Keys) -
 def _joints(
     true: SimulatorModel, model: DirectForecastModel, states: States, steps: tuple[int, ...], seed: int, n_strings: int = 8
 ) -> dict[tuple[Method, int], float]:
-    """Exact total variation of joint distributions, over all states and some random strings."""
+    """Exact total variation of joint distributions, over all states and some random action strings."""
     starts = np.repeat(np.arange(len(states)), n_strings)
     strings = random_strings(derive(seed, 2, np.arange(len(starts))), max(steps), true.n_actions)
     exact, learned = m.transition_matrices(true, states), m.transition_matrices(model.one_step, states)
@@ -197,7 +197,7 @@ def _joints(
 
 
 def _play(cell: Cell, model: DirectForecastModel) -> list[Row]:
-    """Flat Monte Carlo with either kind of forecasts, on episodes of the same seeds."""
+    """Flat Monte Carlo with each kind of forecast, on episodes with the same seeds."""
     settings, rows = cell.settings, []
     for forecasts in ("iterated", "direct"):
         env = make_vec_env(cell.case.make, n_envs=settings.episodes, seed=cell.seed)

@@ -1,4 +1,4 @@
-"""How far a forecast is from the truth, from draws or exactly."""
+"""Errors of forecasts, from samples or exact."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mbagent.types import Actions, Floats, States
 NAN = float("nan")
 
 FEWEST_CERTAIN = 20
-"""Fewer cases with a single possible outcome than that say nothing."""
+"""Smallest number of cases with a single possible outcome for a meaningful share."""
 
 
 def marginal_variation(draws: States, truth: States, cardinalities: tuple[int, ...]) -> float:
@@ -30,9 +30,9 @@ def marginal_variation(draws: States, truth: States, cardinalities: tuple[int, .
 
 
 def inexact_share(draws: States, truth: States) -> float:
-    """Share of draws that are not the state that the world is sure to be in.
+    """Share of samples that differ from the certain next state.
 
-    Only cases in which all true draws [cases, M', F] agree are looked at; NaN if these are fewer than
+    Only cases in which all true samples [cases, M', F] agree are counted; NaN if these are fewer than
     ``FEWEST_CERTAIN``.
     """
     certain = (truth == truth[:, :1]).all(axis=(1, 2))
@@ -54,7 +54,7 @@ def transition_matrices(model: TransitionModel, states: States) -> Floats:
 
 
 def follow(matrices: Floats, starts: Actions, strings: Actions) -> Floats:
-    """Distribution [B, S] after each string [B, n] from the states numbered ``starts`` [B]."""
+    """Distribution [B, S] after each action string [B, n] from the states numbered ``starts`` [B]."""
     n_states = matrices.shape[1]
     result = np.eye(n_states)[starts]
     for action in strings.T:
@@ -72,16 +72,16 @@ def direct_distribution(model: DirectForecastModel, states: States, starts: Acti
 
 
 def joint_variation(found: Floats, truth: Floats) -> float:
-    """Total variation of joint distributions [B, S], mean over B; what ``found`` lacks is mass on other states."""
+    """Total variation of joint distributions [B, S], mean over B; mass missing in ``found`` is on other states."""
     missing = 1.0 - found.sum(axis=1)
     return float((0.5 * (np.abs(found - truth).sum(axis=1) + missing)).mean())
 
 
 def listed_states(model: BaseTransitionModel, start: States, most: int) -> States | None:
-    """All states that the true model can reach, where they are at most ``most`` and no episode terminates; else None."""
+    """All reachable states of the true model, if they are at most ``most`` and no episode terminates; else None."""
     try:
         model.marginals(start[:1], np.zeros(1, dtype=np.int64))
     except NotImplementedError:
         return None
-    machine = model.reachable_mdp(start, max_states=most, n_samples=10_000)
-    return machine.states if machine.complete and not machine.terminated.any() else None
+    mdp = model.reachable_mdp(start, max_states=most, n_samples=10_000)
+    return mdp.states if mdp.complete and not mdp.terminated.any() else None

@@ -1,4 +1,4 @@
-"""The figure and the page that the experiment ends in."""
+"""The figure and the page of the experiment."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MEASURES: dict[str, str] = {
     "inexact": "share of draws that are not the next state",
     "marginal": "total variation of single variables",
 }
-"""Fields of a score, the most telling first."""
+"""Fields of a score, the most informative first."""
 
 _LOOKS: dict[Method, tuple[str, str, str]] = {
     "iterated": ("one-step model, iterated", "#00798c", "o"),
@@ -32,7 +32,7 @@ _LOOKS: dict[Method, tuple[str, str, str]] = {
 
 @dataclass(frozen=True)
 class Line:
-    """Errors at n steps, by method: the case's measure, and single variables; and the direct model's fit, in seconds."""
+    """Errors at n steps by method, in the case's measure and for single variables, and the direct model's fit time in seconds."""
 
     n: int
     errors: dict[Method, Interval]
@@ -52,7 +52,7 @@ class Table:
 
 
 def tables(scores: Sequence[Row], returns: Sequence[Row]) -> list[Table]:
-    """A table for each game that was measured."""
+    """A table for each measured game."""
     found = []
     for case in CASES:
         mine = [score for score in scores if score["case"] == case.name]
@@ -78,15 +78,15 @@ def _line(scores: Sequence[Row], n: int, measure: str) -> Line:
 
 
 def write_page(path: Path, results: Tables, settings: Settings, command: str) -> bytes:
-    """Writes the HTML page, picture and all, into one file; returns the picture as PNG."""
+    """Writes the HTML page with its picture into one file; returns the picture as PNG."""
     found = tables(results["results"], results.get("returns", []))
     figure = draw_errors(found)
-    about = "Error of both ways of forecasting against the number of steps, one panel for each game"
+    about = "Error of both forecasting methods against the number of steps, one panel for each game"
     note = (
         "Means over seeds with 95% t intervals. Total variation of the joint distribution is exact, over all states of the "
-        f"game; where states are too many to list, the share of {settings.n_draws} draws that miss the only possible state; "
-        "where there never is only one, the total variation of single variables between "
-        f"{settings.n_draws} draws and as many true ones, compared with that of two sets of true draws."
+        f"game. If there are too many states, it is the share of {settings.n_draws} samples that miss the only possible state, "
+        "or, if there is never only one, the total variation of single variables between "
+        f"{settings.n_draws} samples and as many true ones, compared with that of two sets of true samples."
     )
     cards = [Card(figure=figure, about=about, notes=[note]), *(_card(table, settings) for table in found)]
     section = Section("Error against the number of steps", cards)
@@ -97,18 +97,18 @@ def write_page(path: Path, results: Tables, settings: Settings, command: str) ->
 
 
 INTRO = (
-    "A model of single steps, iterated, adds error to error. Section 4.2 of Braylan and Miikkulainen 2015 names another way: "
-    "a model of its own for each number of steps n, which is given a string of n actions. Its errors do not add up, but what "
-    "it has to learn is harder. Both ways learned from the same {:,} steps of random play and forecast the same strings of "
-    "random actions, from states of random play that was not learned from; the games themselves give the truth."
+    "An iterated one-step model accumulates errors. Section 4.2 of Braylan and Miikkulainen 2015 proposes an alternative: "
+    "a separate model for each number of steps n, with a string of n actions as input. Its errors do not accumulate, but it is "
+    "harder to learn. Both kinds learned from the same {:,} steps of random play and forecast the same strings of random "
+    "actions, from states of other random play; the games themselves give the true distributions."
 )
 
 
 def _methods(settings: Settings) -> dict[str, str]:
     return {
         "Models": 'The networks (`model="networks"`): predictor and causal conditioner on flat variables; on planes, weights '
-        "shared over positions, with one block of layers for each action of the string. Each action is a group of inputs of "
-        "its own.",
+        "shared over positions, with one block of layers for each action of the string. Each action has its own group of "
+        "inputs.",
         "Cases": f"{settings.n_starts} states of random play; seeds {settings.first_seed} and up.",
     }
 
@@ -144,6 +144,6 @@ def _panel(table: Table) -> Panel:
         if method == "true again" and table.measure != "marginal":
             continue  # zero by definition
         cells = [line.errors[method] for line in table.lines]
-        band = [max(c.low, 0.0) for c in cells], [min(c.high, 1.0) for c in cells]  # every measure is a share
+        band = [max(c.low, 0.0) for c in cells], [min(c.high, 1.0) for c in cells]  # all measures are shares
         lines.append(Curve(steps, [c.estimate for c in cells], colour, label, band=band, marker=marker))
     return Panel(table.name, lines, "steps ahead n", MEASURES[table.measure], y_limits=(0.0, None))

@@ -1,1 +1,1 @@
-"""What is learned from how many environment steps: returns, coverage and error of the model."""
+"""Returns, coverage and model error as functions of the number of environment steps."""

@@ -1,4 +1,4 @@
-"""How soon exploration has tried everything, and how wrong the model is by then, in worlds whose rules are known."""
+"""Coverage of exploration and model error against environment steps, in worlds with known rules."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from worlds.known_rules import exact_world, true_model
 from worlds.registry import World
 
 MAX_PAIRS = 400
-"""Model error is measured on so many reachable (state, action), drawn once."""
+"""Number of reachable (state, action), drawn once, on which model error is measured."""
 
 MAX_OUTCOMES = 1 << 14
-"""More outcomes of a (state, action) than any world here has."""
+"""Upper bound on the number of outcomes of a (state, action) in these worlds."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class Cell:
     """One exploration in one world with one seed.
 
     Attributes:
-        world: where; its rules must be known.
+        world: the world; its rules must be known.
         exploration: the agent's argument.
-        seed: of the agent and the world.
-        marks: environment steps after which to measure, ascending; the model is fitted anew at each.
+        seed: seed of the agent and the world.
+        marks: environment steps after which to measure, ascending; the model is refitted at each.
     """
 
     world: World | DistractorWorld
@@ -46,35 +46,35 @@ class Cell:
 
 
 def reachable(exact: FiniteHorizonMDP) -> NDArray[np.int64]:
-    """Numbers of the states in which an episode can be under way."""
+    """Numbers of the non-terminal states that an episode can reach."""
     steps = (exact.transitions > 0).any(axis=1)
-    met = exact.start > 0
-    while (more := met | (met @ steps)).sum() > met.sum():
-        met = more
-    return np.flatnonzero(met)
+    reached = exact.start > 0
+    while (more := reached | (reached @ steps)).sum() > reached.sum():
+        reached = more
+    return np.flatnonzero(reached)
 
 
 def outcomes(world: World, exact: FiniteHorizonMDP, numbers: NDArray[np.int64], actions: Actions) -> Successors:
-    """What the true rules say of states [N], by their numbers, and actions [N]: every outcome with its probability.
+    """All outcomes with their true probabilities, for states [N], given by their numbers, and actions [N].
 
     Raises:
         ValueError: the world's rules are not known.
     """
     space = FactoredSpace(world.make().observation_space)
     states = space.encode(exact.observations)
-    if world.kind == "rddl":  # no episode ends before its time
+    if world.kind == "rddl":  # no episode ends before its time limit
         rows, following = np.nonzero(exact.transitions[numbers, actions])
         offsets = np.searchsorted(rows, np.arange(len(numbers) + 1)).astype(np.int64)
         chances = exact.transitions[numbers, actions][rows, following]
         return Successors(offsets, states[following], np.zeros(len(rows), dtype=np.bool_), chances)
     known = true_model(world)
     if known is None:
-        raise ValueError(f"The true rules of {world.name} are not at hand.")
+        raise ValueError(f"The true rules of {world.name} are not available.")
     return known[0].successors(states[numbers], actions, MAX_OUTCOMES, 0)
 
 
 def wrongness(model: TransitionModel, truth: Successors, states: States, actions: Actions) -> float:
-    """Mean total variation between what a model says of (state, action) [N] and all their true outcomes."""
+    """Mean total variation between a model's predictions for (state, action) [N] and their true outcomes."""
     rows = truth.rows
     said = np.exp(model.log_prob(states[rows], actions[rows], truth.states, truth.terminated))
     shared = np.bincount(rows, weights=np.minimum(said, truth.probabilities), minlength=len(states))
@@ -82,7 +82,7 @@ def wrongness(model: TransitionModel, truth: Successors, states: States, actions
 
 
 def run_cell(cell: Cell) -> Result[Cell]:
-    """Explores and fits from mark to mark; a row for each. There is no return where a world has no reward.
+    """Explores and fits up to each mark, with a row for each. Worlds without reward have no return.
 
     Raises:
         ValueError: the world's rules are not known.
@@ -93,7 +93,7 @@ def run_cell(cell: Cell) -> Result[Cell]:
     for mark in cell.marks:
         began = time.process_time()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that the reward is learned, or there is none
+            warnings.simplefilter("ignore")  # of a learned or missing reward
             agent.learn(mark - agent.num_timesteps, log_interval=None, reset_num_timesteps=False)
         row = {"world": cell.world.name, "exploration": cell.exploration, "seed": cell.seed, "steps": mark}
         rows.append(row | figures() | {"learn_seconds": time.process_time() - began})
@@ -102,18 +102,18 @@ def run_cell(cell: Cell) -> Result[Cell]:
 
 
 def _exactly(world: World, agent: ModelLearningAgent) -> Callable[[], Row]:
-    """What measures an agent in a world that is known as tables."""
+    """Returns a function that measures an agent in a world given as tables."""
     exact = exact_world(world)
     if exact is None:
-        raise ValueError(f"The true rules of {world.name} are not at hand.")
+        raise ValueError(f"The true rules of {world.name} are not available.")
     n_actions, states = agent.policy.actions.n, agent.policy.factored.encode(exact.observations)
     pairs = _pairs(reachable(exact), n_actions)
     some = pairs[np.random.default_rng(0).permutation(len(pairs))[:MAX_PAIRS]]
     truth = outcomes(world, exact, some[:, 0], some[:, 1])
 
     def figures() -> Row:
-        met = agent.transitions.rows()
-        tried = np.unique(np.column_stack([met.before, met.actions]), axis=0)
+        observed = agent.transitions.rows()
+        tried = np.unique(np.column_stack([observed.before, observed.actions]), axis=0)
         span = exact.optimal_return() - exact.random_return()
         actions = agent.predict(exact.observations, deterministic=True)[0]
         return {
@@ -126,14 +126,14 @@ def _exactly(world: World, agent: ModelLearningAgent) -> Callable[[], Row]:
 
 
 def _with_distractors(world: DistractorWorld, agent: ModelLearningAgent) -> Callable[[], Row]:
-    """What measures an agent in a world that was made up."""
+    """Returns a function that measures an agent in a world with distractors."""
     pairs = _pairs(world.known.reachable(), agent.policy.actions.n)
     some = pairs[np.random.default_rng(0).permutation(len(pairs))[:MAX_PAIRS]]
 
     def figures() -> Row:
-        met = agent.transitions.rows()
+        observed = agent.transitions.rows()
         error = world.wrongness(agent.model, some[:, 0], some[:, 1])
-        return {"tried": world.tried(met.states, met.actions), "error": error, "normalised": float("nan")}
+        return {"tried": world.tried(observed.states, observed.actions), "error": error, "normalised": float("nan")}
 
     return figures
 
@@ -153,7 +153,7 @@ def show(rows: Sequence[Row], run: Run) -> None:
 
 
 def draw_coverage(rows: Sequence[Row]) -> bytes:
-    """A column for each world: share of pairs tried, and model error, against steps; a line for each seed. A PNG."""
+    """Plots the share of tried pairs and model error against steps: a column per world, a line per seed. Returns a PNG."""
     worlds, kinds = grouped(rows, ("world",)), list(grouped(rows, ("exploration",)))
     panels = []
     for figure, label in (("tried", "share of (state, action) tried"), ("error", "model error (total variation)")):

@@ -1,4 +1,4 @@
-"""Learning curves: one agent in one world, played after some numbers of environment steps."""
+"""Learning curves: returns of one agent in one world after given numbers of environment steps."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ PLAYERS = (OURS, "PPO", "DQN", RANDOM)
 
 @dataclass(frozen=True)
 class Cell:
-    """What is learned and when it is looked at.
+    """One agent in one world, with the steps after which it is evaluated.
 
     Attributes:
-        world: where.
+        world: the environment.
         agent: one of PLAYERS.
-        seed: of learning and play.
+        seed: seed of learning and play.
         marks: environment steps after which to play, ascending.
-        episodes: to play each time, the same for all agents.
+        episodes: episodes per mark, the same for all agents.
     """
 
     world: World
@@ -43,10 +43,10 @@ class Cell:
 
 
 def run_cell(cell: Cell) -> Result[Cell]:
-    """Learns from mark to mark; a row for each."""
+    """Learns up to each mark, with a row for each."""
     torch.set_num_threads(1)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that the reward is learned, and of packages around
+        warnings.simplefilter("ignore")  # of a learned reward, and of other packages
         rows = {OURS: _ours, RANDOM: _random}.get(cell.agent, _baseline)(cell)
     last = rows[-1]
     label = f"{last['world']}, {last['agent']}, seed {last['seed']}: {last['return']:.2f} after {last['steps']:,} steps"
@@ -87,7 +87,7 @@ def _ours(cell: Cell) -> list[Row]:
 
 
 def _baseline(cell: Cell) -> list[Row]:
-    """One training for each mark, so that all schedules end there; of likeliest and drawn actions the better count."""
+    """One training per mark, so that schedules end there; the better of most likely and sampled actions counts."""
     rows = []
     for mark in cell.marks:
         began = time.perf_counter()
@@ -116,7 +116,7 @@ def show(rows: Sequence[Row], run: Run) -> None:
 
 
 def draw_curves(rows: Sequence[Row]) -> bytes:
-    """A panel for each world: mean return against environment steps, a line for each agent and seed. A PNG."""
+    """Plots mean return against environment steps: a panel per world, a line per agent and seed. Returns a PNG."""
     panels: list[Panel] = []
     for (world,), mine in grouped(rows, ("world",)).items():
         lines = []

@@ -1,1 +1,1 @@
-"""How exactly models predict next states they have not seen, after how many steps of random play."""
+"""Accuracy of predicted next states on unseen transitions, after given numbers of steps of random play."""

@@ -1,7 +1,7 @@
-"""A dynamic Bayesian network learned by pyAgrum: the field's textbook way, as a yardstick behind the models' protocol.
+"""A dynamic Bayesian network learned by pyAgrum with textbook methods: a baseline with the models' protocol.
 
-Every factor of the next state, and the end, has parents among the state's factors and the action, found by greedy hill climbing
-on BIC; probabilities come from full conditional tables with a smoothing prior. Needs ``pip install "mbagent[yardsticks]"``.
+Each factor of the next state, and termination, has parents among the state's factors and the action, found by hill climbing on
+BIC; probabilities come from full conditional tables with a smoothing prior. Needs ``pip install "mbagent[yardsticks]"``.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mbagent.types import Actions, Bools, Floats, Randomness, States
 from mbagent_envs.random_keys import uniforms
 
 MOST_PARENTS = 8
-"""Parents of one variable: full tables grow with the power of them."""
+"""Maximum number of parents of a variable: full tables grow exponentially with it."""
 
 SMOOTHING = 0.2
 
@@ -46,7 +46,7 @@ class BayesNetModel(BaseTransitionModel):
         self._tables: list[Floats] = []
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
-        """See TransitionModel. Nothing is held out."""
+        """See TransitionModel; no transitions are held out."""
         began, rows = time.perf_counter(), data.rows()
         now = [*(f"x{f}" for f in range(len(self.cardinalities))), "a"]
         then = [*(f"y{f}" for f in range(len(self.cardinalities))), "over"]
@@ -69,10 +69,10 @@ class BayesNetModel(BaseTransitionModel):
 
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
         """See TransitionModel."""
-        luck = uniforms(as_keys(rng, len(states)), len(self._tables))
+        noise = uniforms(as_keys(rng, len(states)), len(self._tables))
         drawn = [
             (p.cumsum(axis=1) < u[:, None]).sum(axis=1).clip(0, p.shape[1] - 1)
-            for p, u in zip(self._distributions(states, actions), luck.T, strict=True)
+            for p, u in zip(self._distributions(states, actions), noise.T, strict=True)
         ]
         return np.stack(drawn[:-1], axis=1).astype(np.int64), drawn[-1] == 1
 
@@ -89,7 +89,7 @@ class BayesNetModel(BaseTransitionModel):
         return result
 
     def state_dict(self) -> dict[str, NDArray[Any]]:
-        """Not kept: a yardstick."""
+        """Empty, since this baseline is not saved."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, NDArray[Any]]) -> None:
@@ -98,9 +98,9 @@ class BayesNetModel(BaseTransitionModel):
 
 
 def _learn(table: NDArray[np.int64], now: list[str], then: list[str], sizes: list[int]) -> Any:
-    """The network, with parents of ``then`` among ``now``."""
+    """Learns the network, with parents of ``then`` among ``now``."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # where warnings are errors, importing it ends the process
+        warnings.simplefilter("ignore")  # if warnings are errors, the import would end the process
         import pyagrum  # noqa: PLC0415 - optional
 
     template, names = pyagrum.BayesNet(), [*now, *then]
@@ -136,7 +136,7 @@ def _axes(array: Floats, cpt: Any, name: str) -> list[str]:
 
 
 def register() -> None:
-    """Makes ``bayesnet`` a model's name."""
+    """Registers ``bayesnet`` as a model's name."""
     register_model("bayesnet", _build)
 
 

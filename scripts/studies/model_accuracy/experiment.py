@@ -1,4 +1,4 @@
-"""Learns worlds from random play and measures predictions of transitions from new random play."""
+"""Learns worlds from random play and measures predictions on new random play."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from worlds.board_games import PushedBox, Switch, TwoPlayers
 NAN = float("nan")
 
 EPISODE = 100
-"""Steps of an episode of random play."""
+"""Number of steps of an episode of random play."""
 
 MOST_UNCERTAIN = 0.25
-"""Transitions in which a larger share of the factors is random, such as new layouts, are not judged by exactness."""
+"""Transitions with a larger share of random factors, such as new layouts, are excluded from the exactness measure."""
 
 SECOND_DRAWS = 64
-"""True draws that must agree on a factor for it to count as certain, in worlds that do not list their successors."""
+"""Number of true samples that must agree on a factor for it to count as certain, in worlds that do not list successors."""
 
 LEARNING_RATE = 0.02
 
 
 @dataclass(frozen=True)
 class Case:
-    """A world, and how it is shown.
+    """A world and its representation.
 
     Attributes:
-        name: what it is called.
-        game: builds it.
-        flat: whether its bits are shown as one row in a random order, so that nothing tells which are neighbours.
+        name: its name.
+        game: creates it.
+        flat: whether its bits are observed as one row in a random order, without information on neighbours.
     """
 
     name: str
@@ -67,15 +67,15 @@ CASES: tuple[Case, ...] = (
 
 @dataclass(frozen=True)
 class Settings:
-    """What to run.
+    """Settings of the experiment.
 
     Attributes:
         cases: names of the worlds.
         models: names of the models.
         steps: numbers of steps to learn from.
         seeds: repetitions.
-        first_seed: seed of the first.
-        n_tests: transitions to test on.
+        first_seed: seed of the first repetition.
+        n_tests: number of test transitions.
 
     Raises:
         ValueError: a setting is out of range.
@@ -96,10 +96,10 @@ class Settings:
             raise ValueError("There is nothing to measure: name at least one model.")
         if "bayesnet" in self.models:
             if importlib.util.find_spec("pyagrum") is None:
-                raise ValueError('The yardstick bayesnet needs pyAgrum: pip install "mbagent[yardsticks]".')
+                raise ValueError('The baseline bayesnet needs pyAgrum: pip install "mbagent[yardsticks]".')
             bayesnet.register()
         for name in self.models:
-            build_model(name, FactoredSpace(MultiBinary(1)), 1, LEARNING_RATE)  # an unknown name is told before all work
+            build_model(name, FactoredSpace(MultiBinary(1)), 1, LEARNING_RATE)  # refuses unknown names before the work starts
         if not self.steps or min(self.steps) < EPISODE:
             raise ValueError(f"Steps to learn from must be {EPISODE} or more, got {list(self.steps)}.")
         check_at_least(self, seeds=1, first_seed=0, n_tests=EPISODE)
@@ -110,15 +110,15 @@ class Score:
     """One model on one world, with one seed.
 
     Attributes:
-        case, model, seed, steps: which.
-        likeliest: share of judged transitions whose likeliest next state is the one met, in all factors that are certain; NaN
-            where none is judged.
-        sampled: the same of a drawn next state.
-        joint: total variation of the joint distribution of next states, exact; NaN where the world lists none or the
+        case, model, seed, steps: identification.
+        likeliest: share of the included transitions whose most likely next state agrees with the observed one in all certain
+            factors; NaN if none is included.
+        sampled: the same for a sampled next state.
+        joint: exact total variation of the joint distribution of next states; NaN if the world does not list it or the
             model has no probabilities.
-        log_likelihood: mean log-probability of the transitions met, nats; the impossible counts as -200.
+        log_likelihood: mean log-probability of the observed transitions, nats; impossible ones count as -200.
         fit_seconds: processor time of the fit.
-        sample_microseconds: processor time of one drawn next state, in a large batch.
+        sample_microseconds: processor time per sampled next state, in a large batch.
     """
 
     case: str
@@ -144,7 +144,7 @@ class Cell:
 
 
 def cells(settings: Settings) -> list[Cell]:
-    """All cells, the largest first."""
+    """All cells, largest first."""
     chosen = [case for case in CASES if case.name in settings.cases]
     found = [
         Cell(case, settings.first_seed + i, steps, settings)
@@ -156,7 +156,7 @@ def cells(settings: Settings) -> list[Cell]:
 
 
 def random_play(game: Game, n_steps: int, seed: int, order: States) -> TransitionBatch:
-    """Transitions of episodes of random play, one after another; the bits in the given order."""
+    """Transitions of consecutive episodes of random play, with the bits in the given order."""
     true, n_episodes = SimulatorModel(game), -(-n_steps // EPISODE)
     rng, states, parts = np.random.default_rng(seed), true.start_states(n_episodes, seed), []
     for _ in range(EPISODE):
@@ -198,7 +198,7 @@ def run_cell(cell: Cell) -> Result[Cell]:
 
 
 def certain_factors(true: SimulatorModel, rows: TransitionBatch, order: States, seed: int) -> Bools:
-    """Which factors of each transition's outcome are not random, bool [N, F]; none of it where too many are."""
+    """Whether each factor of a transition's outcome is not random, bool [N, F]; all False if too many are random."""
     back = np.argsort(order)
     certain = np.ones(rows.states.shape, dtype=np.bool_)
     if true.lists:
@@ -230,7 +230,7 @@ def _score(model: TransitionModel, true: SimulatorModel, rows: TransitionBatch, 
 
 
 def likeliest_states(model: TransitionModel, rows: TransitionBatch, chunk: int = 10_000) -> States:
-    """Each factor's likeliest value, int64 [N, F]."""
+    """Most likely value of each factor, int64 [N, F]."""
     starts = np.concatenate([[0], np.cumsum(model.cardinalities)])[:-1]
     parts = []
     for begin in range(0, len(rows), chunk):
@@ -243,7 +243,7 @@ def likeliest_states(model: TransitionModel, rows: TransitionBatch, chunk: int =
 def joint_variation(
     model: TransitionModel, true: SimulatorModel, rows: TransitionBatch, order: States, most: int = 2000
 ) -> float:
-    """Total variation of the joint distribution of next states, mean over the first transitions; NaN where not listed."""
+    """Total variation of the joint distribution of next states, mean over the first transitions; NaN if not listed."""
     back, few = np.argsort(order), rows.select(np.arange(min(most, len(rows))))
     if not true.lists:
         return NAN
@@ -257,7 +257,7 @@ def joint_variation(
 
 
 def means(scores: Sequence[Row]) -> dict[tuple[str, str, int], dict[str, float]]:
-    """Mean over seeds of each figure, by (case, model, steps)."""
+    """Means over seeds of each measure, by (case, model, steps)."""
     figures = ("likeliest", "sampled", "joint", "log_likelihood", "fit_seconds", "sample_microseconds")
     return {
         (case, model, steps): {name: float(np.mean([row[name] for row in group])) for name in figures}

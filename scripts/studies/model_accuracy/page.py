@@ -1,4 +1,4 @@
-"""The tables and pictures that the studies end in."""
+"""The tables and pictures of the studies."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ KEYS = {
     "agents": ("game",),
     "minatar": ("game", "sticky", "history", "steps"),
 }
-"""Columns that tell rows of a study apart; all others are figures."""
+"""Columns that identify the rows of a study; all others are measures."""
 
 
 def averaged(study: str, rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Means over seeds of each figure."""
+    """Means over seeds of each measure."""
     keys, found = [key for key in KEYS[study] if rows and key in rows[0]], []
     for label in dict.fromkeys(tuple(row[key] for key in keys) for row in rows):
         same = [row for row in rows if tuple(row[key] for key in keys) == label]
@@ -43,19 +43,19 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def shown(value: Any) -> str:
-    """A cell of a table."""
+    """Formats a cell of a table."""
     if isinstance(value, float):
         return format_number(value, 4 if abs(value) < 10 else 1)
     return f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def slope(rows: Sequence[Row], name: str) -> float:
-    """Exponent of a figure in d, by least squares in logarithms."""
+    """Exponent of d in a power law for a measure, by least squares on logarithms."""
     return float(np.polyfit(np.log([row["d"] for row in rows]), np.log([row[name] for row in rows]), 1)[0])
 
 
 def write_page(path: Path, results: Mapping[str, Sequence[Row]], accuracy: Sequence[Row], command: str) -> dict[str, bytes]:
-    """Writes the page with everything measured; returns its pictures by name."""
+    """Writes the page with all results; returns its pictures by name."""
     tables = {study: averaged(study, rows) for study, rows in results.items() if rows}
     pictures = {study: draw(tables[study]) for study, draw in _PICTURES.items() if study in tables}
     sections = [_exact_states(accuracy)] if accuracy else []
@@ -63,15 +63,15 @@ def write_page(path: Path, results: Mapping[str, Sequence[Row]], accuracy: Seque
         title = (STUDIES[study].__doc__ or "").splitlines()[0]
         card = Card(figure=pictures.get(study), table=Table.of(rows, shown), notes=_exponents(rows) if study == "cost" else ())
         sections.append(Section(title, [card]))
-    intro = "Models learn worlds from random play and are tested on new random play, on layouts that they have not seen."
-    Page("Models", "How exactly models predict", intro, sections, command, {}).write(path)
+    intro = "Models learn worlds from random play and are tested on new random play, on unseen layouts."
+    Page("Models", "Accuracy of learned models", intro, sections, command, {}).write(path)
     return pictures
 
 
 def _exact_states(accuracy: Sequence[Row]) -> Section:
     note = (
-        "Means over seeds. Likeliest and sampled: share of transitions whose certain factors are all predicted; transitions to a "
-        "new layout do not count."
+        "Means over seeds. Likeliest and sampled: share of transitions whose certain factors are all predicted correctly, "
+        "without transitions to a new layout."
     )
     return Section("Exact next states", [Card(table=Table.of(accuracy, shown), notes=[note])])
 
@@ -82,7 +82,7 @@ def _exponents(rows: Sequence[Row]) -> list[str]:
 
 
 def draw_changes(rows: Sequence[Row]) -> bytes:
-    """Exactness against steps after a change, one panel a change."""
+    """Exactness against steps after a change, one panel per change."""
     panels = []
     for name in dict.fromkeys(row["change"] for row in rows):
         mine = [row for row in rows if row["change"] == name]
@@ -95,7 +95,7 @@ def draw_changes(rows: Sequence[Row]) -> bytes:
 
 
 def draw_cost(rows: Sequence[Row]) -> bytes:
-    """Times against d, both on logarithmic scales."""
+    """Times against d, on logarithmic scales."""
     d, panels = [row["d"] for row in rows], []
     for name in ("fit seconds", "sample microseconds"):
         times = [row[name] for row in rows]
@@ -107,13 +107,13 @@ def draw_cost(rows: Sequence[Row]) -> bytes:
 
 
 def draw_trust(rows: Sequence[Row]) -> bytes:
-    """How often predictions were wrong against the estimate of it."""
+    """Frequency of wrong predictions against its estimate."""
     lines = [Line([0, 1], [0, 1], "#9aa3ad", marker="", style="--")]
     for number, name in enumerate(dict.fromkeys(row["world"] for row in rows)):
         mine = sorted((row["estimate"], row["rate"]) for row in rows if row["world"] == name and row["bin"] != "all")
         estimates, rates = zip(*mine, strict=True)
         lines.append(Line(estimates, rates, f"C{number}", name))
-    panel = Panel("", lines, "estimated probability of a wrong prediction", "share that was wrong")
+    panel = Panel("", lines, "estimated probability of a wrong prediction", "observed share of wrong predictions")
     return draw_panels([panel], size=(4.4, 3.6))
 
 

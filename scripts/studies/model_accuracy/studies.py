@@ -1,6 +1,6 @@
-"""Further questions about models: what changes cost, what carries over, what it takes, how honest they are.
+"""Further studies of models: changes of rules, transfer, cost, dependencies, and error estimates.
 
-Each study is a function of (seed, full) that returns rows: plain dictionaries with the same keys.
+Each study is a function of (seed, full) that returns rows: dictionaries with the same keys.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ N_TESTS = 20_000
 
 
 def learned(space: FactoredSpace, n_actions: int, *parts: TransitionBatch, name: str = "auto") -> TransitionModel:
-    """A model fitted to some transitions, one part after another."""
+    """A model fitted to consecutive parts of transitions."""
     data = TransitionDataset(space.cardinalities, n_actions)
     for number, part in enumerate(parts):
         shifted = TransitionBatch(
@@ -59,14 +59,14 @@ def learned(space: FactoredSpace, n_actions: int, *parts: TransitionBatch, name:
 
 
 def exact(model: TransitionModel, tests: TransitionBatch, certain: Bools) -> float:
-    """Share of judged transitions whose certain factors are all foretold."""
+    """Share of the included transitions whose certain factors are all predicted correctly."""
     judged = certain.any(axis=1)
     found, _ = likeliest(model, tests.states, tests.actions)
     return float(((found == tests.next_states) | ~certain).all(axis=1)[judged].mean())
 
 
 def changes(seed: int, full: bool) -> list[Row]:
-    """After 10,000 steps the rules change: exactness after further steps, beside learning from these alone."""
+    """The rules change after 10,000 steps: exactness after further steps, compared with learning from these alone."""
     rows = []
     for name, make in CHANGES.items():
         before, after = make()
@@ -84,7 +84,7 @@ def changes(seed: int, full: bool) -> list[Row]:
 
 
 def alarms(seed: int, full: bool) -> list[Row]:
-    """False alarms: variables that are taken for changed in worlds whose rules never do."""
+    """False alarms: variables with detected change points in worlds whose rules never change."""
     rows = []
     for case in CASES:
         game = case.game()
@@ -101,7 +101,7 @@ def alarms(seed: int, full: bool) -> list[Row]:
 
 
 def transfer(seed: int, full: bool) -> list[Row]:
-    """Maneuverer learned on size 6, used on other sizes without learning anew."""
+    """Maneuverer learned on size 6 and used on other sizes without further learning."""
     game = Maneuverer(size=6)
     space = FactoredSpace(game.observation_space)
     model = learned(space, 4, random_play(game, 20_000, seed, np.arange(len(space))))
@@ -121,7 +121,7 @@ def transfer(seed: int, full: bool) -> list[Row]:
 
 
 def cost(seed: int, full: bool) -> list[Row]:
-    """Time of fit and of one sampled state on Maneuverer's planes against the number of variables d."""
+    """Time of the fit and of one sampled state, on Maneuverer's planes, against the number of variables d."""
     rows = []
     for size in (4, 6, 9, 12, 16, 24) if full else (4, 8, 16):
         game = Maneuverer(size=size)
@@ -145,7 +145,7 @@ def cost(seed: int, full: bool) -> list[Row]:
 
 
 def parents(seed: int, full: bool) -> list[Row]:
-    """Which variables were found to hang on which others, against the truth found by changing one at a time."""
+    """Learned dependencies between variables, compared with true ones found by changing one variable at a time."""
     rows = []
     for case in CASES:
         if not case.flat:
@@ -156,11 +156,11 @@ def parents(seed: int, full: bool) -> list[Row]:
         model = learned(flat, int(game.action_space.n), random_play(game, steps, seed, np.arange(len(space))))
         assert isinstance(model, DecisionGraphModel)
         layout = model.fitted.layout
-        units = [layout.members[a:b] for a, b in itertools.pairwise(layout.first[:-2])]
-        true, found = true_parents(game, units, seed), np.zeros((len(units), len(units)), dtype=np.bool_)
-        for v in range(len(units)):
-            asked = parent_factors(layout, tested_features(model.fitted.usual, v))
-            found[v] = [bool(asked & set(members.tolist())) for members in units]
+        groups = [layout.members[a:b] for a, b in itertools.pairwise(layout.first[:-2])]
+        true, found = true_parents(game, groups, seed), np.zeros((len(groups), len(groups)), dtype=np.bool_)
+        for v in range(len(groups)):
+            tested = parent_factors(layout, tested_features(model.fitted.usual, v))
+            found[v] = [bool(tested & set(members.tolist())) for members in groups]
         np.fill_diagonal(found, False)
         hits = int((found & true).sum())
         shares = {"precision": hits / found.sum() if found.any() else NAN, "recall": hits / true.sum() if true.any() else NAN}
@@ -168,11 +168,11 @@ def parents(seed: int, full: bool) -> list[Row]:
     return rows
 
 
-def true_parents(game: Game, units: Sequence[Ints], seed: int, n: int = 3000) -> Bools:
-    """Which variables hang on which others, bool [U, U], by changing one at a time in states met in random play.
+def true_parents(game: Game, groups: Sequence[Ints], seed: int, n: int = 3000) -> Bools:
+    """True dependencies between variables, bool [U, U], found by changing one at a time in states of random play.
 
-    Bits are switched, groups get another bit; the same luck decides before and after. Steps that redraw almost everything, and
-    changes that lead to no state of the game, do not count.
+    Bits are flipped, mutex groups get another bit, with the same random numbers before and after. Steps that redraw almost all
+    variables, and changes that give no valid state of the game, are ignored.
     """
     true, rng = SimulatorModel(game), np.random.default_rng(seed)
     size, shape = len(true.cardinalities), game.observation_space.shape
@@ -180,8 +180,8 @@ def true_parents(game: Game, units: Sequence[Ints], seed: int, n: int = 3000) ->
     normal, _ = true.sample(rows.states, rows.actions, keys)
     counts = (normal != rows.states).sum(axis=1)
     most = 2.0 * max(1.0, float(np.quantile(counts, 0.95)))
-    found = np.zeros((len(units), len(units)), dtype=np.bool_)
-    for u, members in enumerate(units):
+    found = np.zeros((len(groups), len(groups)), dtype=np.bool_)
+    for u, members in enumerate(groups):
         changed = rows.states.copy()
         if len(members) == 1:
             changed[:, members[0]] ^= 1
@@ -191,13 +191,13 @@ def true_parents(game: Game, units: Sequence[Ints], seed: int, n: int = 3000) ->
         other, _ = true.sample(changed, rows.actions, keys)
         few = (counts <= most) & ((other != changed).sum(axis=1) <= most)
         differs = (normal != other)[few & valid].sum(axis=0) > 2
-        found[:, u] = [bool(differs[own].any()) for own in units]
+        found[:, u] = [bool(differs[own].any()) for own in groups]
     np.fill_diagonal(found, False)
     return found
 
 
 def trust(seed: int, full: bool) -> list[Row]:
-    """Estimated probabilities of a wrong prediction against how often it was wrong, in bins."""
+    """Estimated probabilities of a wrong prediction against observed frequencies, in bins."""
     rows = []
     chosen = (("Maneuverer, flat", 2000), ("two players, flat", 5000), ("pushed box, flat", 5000), ("switch, flat", 5000))
     for name, steps in chosen if full else chosen[:2]:
@@ -227,7 +227,7 @@ def trust(seed: int, full: bool) -> list[Row]:
 
 
 def area(scores: Floats, positive: Bools) -> float:
-    """Probability that a positive case scores higher than another (area under the ROC curve); NaN where all are alike."""
+    """Probability that a positive case scores higher than a negative one (area under the ROC curve); NaN for one class only."""
     n = int(positive.sum())
     if n in (0, len(positive)):
         return NAN
@@ -236,7 +236,7 @@ def area(scores: Floats, positive: Bools) -> float:
 
 
 def agents(seed: int, full: bool) -> list[Row]:
-    """Maneuverer after 5,000 steps of random play against the same planner on the true model; cost beside PPO's."""
+    """Maneuverer after 5,000 steps of random play, compared with the same planner on the true model; cost compared with PPO."""
     env = gym.make("mbagent/Maneuverer-v0")
     game = Maneuverer()
     episodes = 40 if full else 4
@@ -283,7 +283,7 @@ class Question:
 
 
 def questions(names: Sequence[str], seeds: Sequence[int], full: bool) -> list[Question]:
-    """All parts of some studies with all seeds.
+    """All parts of the given studies with all seeds.
 
     Raises:
         ValueError: a study is unknown, or its packages are missing.
@@ -302,5 +302,5 @@ def answer(question: Question) -> Result[Question]:
 
 
 def parts(study: str, full: bool) -> list[Study]:
-    """A study as pieces of work that may run, and be kept, one by one."""
+    """The parts of a study, which are run and saved separately."""
     return [partial(minatar, variant=each) for each in variants(full)] if study == "minatar" else [STUDIES[study]]

@@ -1,1 +1,1 @@
-"""Speed and quality of planning and of sampling, beside other packages (paper 4.1)."""
+"""Speed and quality of planning and sampling, compared with other packages (paper 4.1)."""

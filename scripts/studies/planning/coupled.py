@@ -1,4 +1,4 @@
-"""What learned values are worth in worlds of many noisy variables, too large to solve."""
+"""Benefit of fitted leaf values in MDPs with many noisy variables that are too large to solve."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from mbagent_envs.random_keys import derive
 from worlds.coupled import CoupledWorld
 
 EPISODES, STEPS = 16, 40
-"""Episodes played side by side, and their length."""
+"""Number of episodes played in parallel, and their length."""
 
 _SALT = 0xC40D
 
 
 def play(world: CoupledWorld, act: Callable[[States], Actions], seed: int) -> Floats:
-    """Return [EPISODES] of each episode."""
+    """Plays episodes in parallel and returns their returns [EPISODES]."""
     rng = np.random.default_rng([seed, _SALT])
     states, total = world.start[rng.integers(len(world.start), size=EPISODES)], np.zeros(EPISODES)
     for step in range(STEPS):
@@ -33,7 +33,7 @@ def play(world: CoupledWorld, act: Callable[[States], Actions], seed: int) -> Fl
 
 
 def compare_values(world: CoupledWorld, seed: int) -> list[Row]:
-    """Rows of random play, and of the default planner without and with learned values."""
+    """Rows for random play, and for the default planner without and with fitted leaf values."""
     rng, rows = np.random.default_rng(seed), []
     returns = play(world, lambda states: rng.integers(world.model.n_actions, size=len(states)), seed)
     rows.append(_row(world, "random", returns, 0.0, 0.0))
@@ -41,7 +41,7 @@ def compare_values(world: CoupledWorld, seed: int) -> list[Row]:
         planner = MctsPlanner(PlannerSettings(learn_values=learn_values, seed=seed))
         planner.set_model(world.model, world.start)
         planner.set_goal(world.goal)
-        planner.plan(world.start[:1])  # compiles
+        planner.plan(world.start[:1])  # includes compilation
         planner.set_goal(world.goal)
         began = time.process_time()
         planner.plan(world.start[:1])

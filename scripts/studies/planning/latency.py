@@ -1,4 +1,4 @@
-"""What a decision costs beside a forward pass of PPO on the same observations, and what it is worth at that setting."""
+"""Cost of a decision compared with a forward pass of PPO on the same observations, and returns at the same setting."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from worlds.known_rules import Scale
 
 @dataclass(frozen=True)
 class Setting:
-    """How a game is played here.
+    """Settings with which a game is played.
 
     Attributes:
-        key: the case.
-        num_simulations: of the search.
+        key: key of the case.
+        num_simulations: simulations of the search.
         settings: further PlannerSettings.
     """
 
@@ -42,16 +42,16 @@ SETTINGS = (
     Setting("flier_catcher", 8, {"lookahead_states": 24, "lookahead_samples": 1}),
     Setting("maneuverer", 16, {"lookahead_states": 80}),
 )
-"""Small budgets that suffice for 0.95, for Maneuverer for 0.90."""
+"""Small budgets that suffice for a normalised return of 0.95 (Maneuverer: 0.90)."""
 
 LEARNED_FROM, OBSERVATIONS = 20_000, 300
 
 
 def measure(setting: Setting, seed: int, scale: Scale, episodes: int) -> list[Row]:
-    """Rows of a game: with its own reward, and with a plain Python function that says the same.
+    """Rows of a game: with its own reward, and with an equivalent plain Python function.
 
-    Observations are those of new episodes, none twice; the first decisions, which compile, and what is done once for a goal are
-    timed apart.
+    Observations are distinct and from new episodes; the first decisions, which include compilation, and the work done once
+    per goal are timed separately.
     """
     case, game = find_case(setting.key), find_case(setting.key).game
     assert game is not None
@@ -70,7 +70,7 @@ def measure(setting: Setting, seed: int, scale: Scale, episodes: int) -> list[Ro
 
     rows = []
     for name, reward in (("own", None), ("Python", plain)):
-        agent.predict(observations[0])  # compiles
+        agent.predict(observations[0])  # includes compilation
         began = time.process_time()
         agent.set_reward(reward)
         agent.predict(observations[0])
@@ -87,7 +87,7 @@ def measure(setting: Setting, seed: int, scale: Scale, episodes: int) -> list[Ro
 
 
 def steady(setting: Setting, seed: int, decisions: int) -> Row:
-    """Memory of this process after a tenth of many decisions and after all, MiB, and time of the first and last tenth of them."""
+    """Memory of this process (MiB) after a tenth of the decisions and after all, and times of the first and last tenth."""
     case = find_case(setting.key)
     env = case.make_env()
     agent = ModelLearningAgent(
@@ -112,7 +112,7 @@ def steady(setting: Setting, seed: int, decisions: int) -> Row:
 
 
 def mebibytes_held() -> float:
-    """Memory that this process holds, MiB; where the system does not tell, the most that it has held so far."""
+    """Current memory of this process, MiB; its peak so far if the system does not report the current value."""
     statm = Path("/proc/self/statm")
     if statm.exists():
         return int(statm.read_text(encoding="ascii").split()[1]) * resource.getpagesize() / 2**20
@@ -120,7 +120,7 @@ def mebibytes_held() -> float:
 
 
 def distinct_observations(env: Any, n: int, seed: int) -> list[Any]:
-    """Observations of random play, none twice if there are so many."""
+    """Observations of random play, distinct if there are enough."""
     rng, found, seen = np.random.default_rng(seed), [], set()
     obs, _ = env.reset(seed=seed)
     for step in range(20 * n):
@@ -136,7 +136,7 @@ def distinct_observations(env: Any, n: int, seed: int) -> list[Any]:
 
 
 def milliseconds(predict: Callable[[Any], Any], observations: Sequence[Any]) -> float:
-    """Median processor time of a decision about one observation, in milliseconds."""
+    """Median processor time of a decision for one observation, in milliseconds."""
     times = []
     for obs in observations:
         began = time.process_time()

@@ -1,4 +1,4 @@
-"""The library's search through learned networks beside mctx's: speed, regret, and processor time to equal regret."""
+"""The library's search with learned networks compared with mctx: speed, regret, and processor time to equal regret."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from studies.planning.networks import AT_ONCE, BUDGETS, SEEDS, NetworkTask, Pair
 
 MCTX = "mctx, Gumbel MuZero"
 HORIZON, WAVE = 15, 256
-"""Steps of a simulation, as in mctx; simulations between two calls of the model, at most."""
+"""Maximum steps of a simulation, as in mctx; maximum number of simulations between two calls of the model."""
 
 
 class Effort(NamedTuple):
-    """How much is spent on a decision; see PlannerSettings.
+    """Search effort of a decision; see PlannerSettings.
 
     Attributes:
-        lookahead_states, lookahead_samples: of the machine that the search starts from.
-        simulations: of the search.
+        lookahead_states, lookahead_samples: size of the lookahead that initialises the search.
+        simulations: simulations of the search.
     """
 
     lookahead_states: int
@@ -32,7 +32,7 @@ class Effort(NamedTuple):
     simulations: int
 
     def of(self, task: NetworkTask) -> str:
-        """What the search is called."""
+        """Name of the search."""
         pruned = ", pruned" if task.pruned else ""
         return f"mbagent{pruned}, {self.lookahead_states} states, {self.lookahead_samples} draws"
 
@@ -47,22 +47,22 @@ EFFORTS = (
     Effort(64, 4, 1024),
     Effort(160, 4, 1024),
 )
-"""What is compared; the last one's machine is that of the default settings."""
+"""The compared efforts; the last has the lookahead of the default settings."""
 
 
 @dataclass(frozen=True)
 class NetworkRow:
-    """A search through networks with a budget; times are processor time, rates are over all roots.
+    """A search with networks and a budget; times are processor times, rates are over all roots.
 
     Attributes:
         search: its name.
         simulations: its budget.
-        regret: mean over random goals, starts and seeds, as a share of what random actions lose: 0 is perfect.
+        regret: mean over random goals, starts and seeds, relative to that of random actions: 0 is perfect.
         error: standard error over goals.
         regret_own: the same with the game's own goal.
-        ms_1, ms_16: milliseconds of a decision from one root, and of each of 16 at once.
-        simulations_1, simulations_16: simulations a second.
-        samples_1, samples_16: next states drawn from the networks a second; of mbagent distinct ones only.
+        ms_1, ms_16: milliseconds per decision, for one root and for 16 at once.
+        simulations_1, simulations_16: simulations per second.
+        samples_1, samples_16: next states sampled from the networks per second; for mbagent, distinct ones only.
     """
 
     search: str
@@ -80,18 +80,18 @@ class NetworkRow:
 
 @dataclass(frozen=True)
 class RatioRow:
-    """mctx with a budget, and the cheapest of the library's efforts that loses no more.
+    """mctx with a budget, and the cheapest effort of the library with no more regret.
 
     Attributes:
-        roots: searched at once.
-        simulations: mctx's budget.
-        regret: mctx's.
-        ms: mctx's, of a decision.
-        ours: the library's effort; empty where none loses as little.
-        ours_regret, ours_ms: its figures.
-        ratio: times less processor time to regret as low.
-        simulations_ratio: times as many simulations a second, with as many simulations and no more regret, at most; nan where
-            that was not measured.
+        roots: number of roots searched at once.
+        simulations: budget of mctx.
+        regret: regret of mctx.
+        ms: milliseconds per decision of mctx.
+        ours: the library's effort; empty if none has as little regret.
+        ours_regret, ours_ms: regret and milliseconds per decision of this effort.
+        ratio: processor time of mctx divided by that of this effort.
+        simulations_ratio: largest ratio of simulations per second, at an equal number of simulations and no more regret; nan
+            if not measured.
     """
 
     roots: int
@@ -106,7 +106,7 @@ class RatioRow:
 
 
 def planner_for(task: NetworkTask, goal: PairwiseGoal, effort: Effort, seed: int) -> GraphSearch:
-    """The library's search. It is shown no start states: every decision pays for all that it imagines."""
+    """The library's search. It has no start states, so each decision includes the cost of all its expansions."""
     settings = PlannerSettings(
         num_simulations=effort.simulations,
         gamma=task.gamma,
@@ -123,16 +123,16 @@ def planner_for(task: NetworkTask, goal: PairwiseGoal, effort: Effort, seed: int
 
 
 def _shares(task: NetworkTask, actions: Sequence[Ints]) -> tuple[float, float, float]:
-    """(regret over the random goals, its error, regret under the game's own) of actions [seeds, N_STARTS] for each goal."""
+    """(regret over the random goals, its error, regret under the game's own goal) of actions [seeds, N_STARTS] for each goal."""
     own, *others = (task.regrets(goal, taken) for goal, taken in enumerate(actions))
     return float(np.mean(others)), float(np.std(others, ddof=1) / np.sqrt(len(others))), own
 
 
 def _timed(task: NetworkTask, effort: Effort, n_roots: int, repetitions: int) -> tuple[float, float]:
-    """(seconds of a call, the median, and distinct next states drawn in it, the mean), the game's own goal."""
+    """(median seconds per call, mean number of distinct next states sampled in it), with the game's own goal."""
     roots, seconds, drawn = np.resize(task.roots, (n_roots, task.roots.shape[1])), [], 0.0
     planner = planner_for(task, task.goals[0], effort, 0)
-    for repetition in range(repetitions + 1):  # the first one compiles and makes room
+    for repetition in range(repetitions + 1):  # the first one includes compilation and memory allocation
         calls, before = max(1, 16 // n_roots), planner.expanded
         began = time.process_time()
         for call in range(calls):
@@ -155,7 +155,7 @@ def measure_own(task: NetworkTask, effort: Effort, repetitions: int = 5) -> Netw
 
 
 def rows_of_mctx(task: NetworkTask, found: PeerOnNetworks) -> list[NetworkRow]:
-    """The same of mctx; it draws a next state in every simulation."""
+    """The same for mctx, which samples one next state per simulation."""
     rows = []
     for n in BUDGETS:
         one, many = (next(s for s in found.speeds if (s.roots, s.simulations) == (n_roots, n)) for n_roots in AT_ONCE)
@@ -166,7 +166,7 @@ def rows_of_mctx(task: NetworkTask, found: PeerOnNetworks) -> list[NetworkRow]:
 
 
 def ratios(own: Sequence[NetworkRow], peer: Sequence[NetworkRow]) -> list[RatioRow]:
-    """What the library's efforts cost beside each of the peer's budgets."""
+    """Cost of the library's efforts compared with each of the peer's budgets."""
     rows = []
     for key in AT_ONCE:
         for row in peer:

@@ -1,4 +1,4 @@
-"""Searching in a game through its learned networks: the task, and its export as plain arrays for the peers."""
+"""Search in a game with learned networks: the task, and its export as plain arrays for the peers."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ WIDTH = 20
 """Columns of the GeyserRunner that is learned: d = 30 bits."""
 
 BUDGETS = (16, 64, 256, 1024)
-"""Simulations with which mctx chooses; it is timed with each from one root and from 16 at once."""
+"""Budgets of mctx; each is timed with one root and with 16 at once."""
 
 AT_ONCE = (1, 16)
-"""Roots that searches are timed at."""
+"""Numbers of roots for timing."""
 
 N_GOALS, N_STARTS, SEEDS = 8, 24, (0, 1, 2)
-"""Random goals, states to choose an action in, and searches in each of them."""
+"""Number of random goals, of states in which an action is chosen, and of searches in each."""
 
 HIT_COST = 2.0
 
 
 class PairwiseGoal:
-    """A reward of the next state y alone: ``linear @ y + y @ pairs @ y``.
+    """A reward that depends only on the next state y: ``linear @ y + y @ pairs @ y``.
 
     Args:
         linear: float64 [F].
@@ -58,17 +58,17 @@ class PairwiseGoal:
 
 @dataclass(frozen=True)
 class NetworkTask:
-    """A learned game, and what is wanted in it.
+    """A learned game and its goals.
 
     Attributes:
-        data: random play in it.
-        model: predictor and causal conditioner, trained on that.
+        data: random play.
+        model: predictor and causal conditioner, trained on this data.
         goals: the game's own reward, and random ones.
-        q: exact values of the actions in the starts under each goal, in the true game, [goals, N_STARTS, A].
-        starts: states to choose an action in, int64 [N_STARTS, F].
-        roots: states of random play to time searches from, int64 [R, F].
-        gamma: discount of a step; leaves are worth 0.
-        pruned: whether the model is.
+        q: exact action values in the starts under each goal, in the true game, [goals, N_STARTS, A].
+        starts: states in which an action is chosen, int64 [N_STARTS, F].
+        roots: states of random play from which searches are timed, int64 [R, F].
+        gamma: discount factor; leaf values are 0.
+        pruned: whether the model is pruned.
     """
 
     data: TransitionDataset
@@ -81,13 +81,13 @@ class NetworkTask:
     pruned: bool = False
 
     def regrets(self, goal: int, actions: Ints) -> float:
-        """Mean loss of ``actions`` [..., N_STARTS] under a goal, as a share of what random actions lose there."""
+        """Mean regret of ``actions`` [..., N_STARTS] under a goal, relative to that of random actions."""
         best, places = self.q[goal].max(axis=1), np.arange(len(self.starts))
         return float((best - self.q[goal][places, actions]).mean() / (best - self.q[goal].mean(axis=1)).mean())
 
 
 def random_play(game: GeyserRunner, n: int, seed: int, episode: int = 50) -> TransitionDataset:
-    """Transitions of random play, int64, ``episode`` steps an episode."""
+    """Transitions of random play, int64, with ``episode`` steps per episode."""
     n_bits, n_actions = int(np.prod(game.observation_space.shape)), len(game.action_names)
     n_games, rng = max(1, n // episode), np.random.default_rng(seed)
     data, obs = TransitionDataset((2,) * n_bits, n_actions), game.initial(derive(seed, np.arange(n_games)))
@@ -102,7 +102,7 @@ def random_play(game: GeyserRunner, n: int, seed: int, episode: int = 50) -> Tra
 
 
 def goals_of(n: int) -> tuple[PairwiseGoal, ...]:
-    """The game's own goal, and ``n`` with a standard normal income in each column instead; a hit costs the same in all."""
+    """The game's own goal, and ``n`` with standard normal rewards of the columns instead; hits cost the same in all."""
     d, half = WIDTH + WIDTH // 2, WIDTH // 2
     pairs = np.zeros((d, d))
     pairs[np.arange(WIDTH - half, WIDTH), np.arange(WIDTH, d)] = -HIT_COST
@@ -111,7 +111,7 @@ def goals_of(n: int) -> tuple[PairwiseGoal, ...]:
 
 
 def exact_values(goal: PairwiseGoal, gamma: float) -> tuple[Ints, Floats]:
-    """All states int64 [S, F] of the true game, and the exact values [S, A] of their actions under a goal."""
+    """All states int64 [S, F] of the true game, and their exact action values [S, A] under a goal."""
     game, half = GeyserRunner(width=WIDTH, hit_cost=HIT_COST), WIDTH // 2
     states = np.zeros((WIDTH * half, WIDTH + half), dtype=np.int64)
     number = np.arange(len(states))
@@ -129,25 +129,25 @@ def build_task(seed: int, n_steps: int = 5000) -> NetworkTask:
     """Learns GeyserRunner from random play.
 
     Args:
-        seed: of play and fit, and of the starts.
-        n_steps: of random play.
+        seed: seed of play, fit and starts.
+        n_steps: steps of random play.
     """
     data = random_play(GeyserRunner(width=WIDTH, hit_cost=HIT_COST), n_steps, seed)
     model = NeuralTransitionModel(data.cardinalities, data.n_actions)
     model.fit(data, seed=seed)
-    met = data.rows().states
-    distinct = np.unique(met, axis=0)
+    observed = data.rows().states
+    distinct = np.unique(observed, axis=0)
     starts = distinct[np.random.default_rng(seed).permutation(len(distinct))[:N_STARTS]]
     goals, values = goals_of(N_GOALS), []
     for goal in goals:
         states, q = exact_values(goal, NetworkTask.gamma)
         place = {state.tobytes(): i for i, state in enumerate(states)}
         values.append(q[[place[state.tobytes()] for state in starts]])
-    return NetworkTask(data, model, goals, np.stack(values), starts, met[:: max(1, len(met) // 16)][:16])
+    return NetworkTask(data, model, goals, np.stack(values), starts, observed[:: max(1, len(observed) // 16)][:16])
 
 
 def pruned(task: NetworkTask, fraction: float, seed: int) -> NetworkTask:
-    """The same task with the model pruned; the given one keeps its own."""
+    """The same task with a pruned copy of the model."""
     model = NeuralTransitionModel(task.data.cardinalities, task.data.n_actions)
     model.load_state_dict(task.model.state_dict())
     model.prune(task.data, fraction, seed=seed)
@@ -155,10 +155,10 @@ def pruned(task: NetworkTask, fraction: float, seed: int) -> NetworkTask:
 
 
 def exported(task: NetworkTask) -> dict[str, NDArray[np.generic]]:
-    """Everything that a sampler needs, as plain arrays: see ``DenseWeights`` and ``GroupWeights`` for their meaning.
+    """All arrays that a sampler needs; see ``DenseWeights`` and ``GroupWeights`` for their meaning.
 
     Raises:
-        ValueError: the model is not what the peers' script can sample: bits, one hidden layer, a causal conditioner.
+        ValueError: the peers' script cannot sample the model: it needs bits, one hidden layer, a causal conditioner.
     """
     model = task.model
     config, codec = model.config, model.codec
@@ -184,12 +184,12 @@ def exported(task: NetworkTask) -> dict[str, NDArray[np.generic]]:
 
 
 class PeerOnNetworks(NamedTuple):
-    """What mctx did.
+    """Results of mctx.
 
     Attributes:
-        speeds: with each budget, from one root and from 16.
+        speeds: speeds with each budget, from one root and from 16.
         choices: budget -> actions int64 [goals, seeds, N_STARTS].
-        mean_next_state: of its sampler's draws from the first root under action 0, [F], to compare.
+        mean_next_state: mean of its samples from the first root under action 0, [F], as a check.
     """
 
     speeds: list[Speed]
@@ -198,16 +198,16 @@ class PeerOnNetworks(NamedTuple):
 
 
 def run_networks_in_mctx(python: Path, task: NetworkTask, repetitions: int = 5) -> PeerOnNetworks:
-    """Searches through the networks in mctx.
+    """Runs searches with the networks in mctx.
 
     Raises:
-        PeerError: it did not run.
+        PeerError: the script failed.
     """
     speeds = np.array([(n_roots, budget) for budget in BUDGETS for n_roots in AT_ONCE])
     with TemporaryDirectory() as folder:
         path = Path(folder) / "networks.npz"
-        asked = {"speeds": speeds, "repetitions": np.asarray(repetitions), "budgets": np.array(BUDGETS), "seeds": np.array(SEEDS)}
-        np.savez(path, allow_pickle=False, **exported(task), **asked)
-        told = run_script(python, "mctx_networks", [str(path)])
-    choices = {int(n): np.array(actions, dtype=np.int64) for n, actions in told["choices"].items()}
-    return PeerOnNetworks([Speed(**speed) for speed in told["speeds"]], choices, np.array(told["mean_next_state"]))
+        query = {"speeds": speeds, "repetitions": np.asarray(repetitions), "budgets": np.array(BUDGETS), "seeds": np.array(SEEDS)}
+        np.savez(path, allow_pickle=False, **exported(task), **query)
+        output = run_script(python, "mctx_networks", [str(path)])
+    choices = {int(n): np.array(actions, dtype=np.int64) for n, actions in output["choices"].items()}
+    return PeerOnNetworks([Speed(**speed) for speed in output["speeds"]], choices, np.array(output["mean_next_state"]))

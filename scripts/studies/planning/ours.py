@@ -1,4 +1,4 @@
-"""The library's own searches on table worlds, behind one small interface."""
+"""The library's own searches in tabular MDPs, behind a common interface."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from worlds.random_mdps import RandomMDP
 
 
 class TableSearch(Protocol):
-    """A search in a world that was prepared."""
+    """A search that is prepared for one MDP."""
 
     def __call__(self, roots: Ints, n_simulations: int, seed: int) -> tuple[Ints, int]:
-        """(actions int64 [R], next states drawn in all) from roots int64 [R]; one's outcome must not depend on the others."""
+        """(actions int64 [R], total number of sampled next states) for roots int64 [R], independent of each other."""
         ...
 
 
 Prepare: TypeAlias = Callable[[RandomMDP], TableSearch]
-"""What is done once for a world: the rules and the goal are given, and what a state is worth that was not looked beyond."""
+"""Preparation for one MDP, given its rules, the goal and leaf values."""
 
 
 def as_model(world: RandomMDP) -> TabularMDP:
-    """The world as a transition model of one factor."""
+    """The MDP as a transition model with one factor."""
     n_states, n_actions, n_successors = world.successors.shape
     following, nowhere = np.ascontiguousarray(world.successors.reshape(-1)), np.zeros(0, dtype=np.int64)
     offsets = np.arange(n_states * n_actions + 1) * n_successors
@@ -39,7 +39,7 @@ def as_model(world: RandomMDP) -> TabularMDP:
 
 
 def with_rollouts(world: RandomMDP) -> TableSearch:
-    """The agent's planner as textbook UCT. It values leaves by random play and cannot be given leaf values."""
+    """The agent's planner as textbook UCT, with random rollouts instead of the given leaf values."""
     model, none = as_model(world), np.zeros((0, 1), dtype=np.int64)
 
     def search(roots: Ints, n_simulations: int, seed: int) -> tuple[Ints, int]:
@@ -55,10 +55,10 @@ def with_rollouts(world: RandomMDP) -> TableSearch:
 
 
 def on_machine(world: RandomMDP) -> TableSearch:
-    """Tree search on the world as a known machine."""
+    """Tree search on the MDP as a known reachable MDP."""
     model = as_model(world)
     following, over = model.next_states, model.terminated
-    machine = known_machine(
+    mdp = known_machine(
         model.offsets,
         following,
         model.probabilities,
@@ -70,20 +70,20 @@ def on_machine(world: RandomMDP) -> TableSearch:
     )
 
     def search(roots: Ints, n_simulations: int, seed: int) -> tuple[Ints, int]:
-        found = search_machine(machine, roots, n_simulations, seed)
+        found = search_machine(mdp, roots, n_simulations, seed)
         return best_actions(found.values), found.steps
 
     return search
 
 
 OWN_SEARCHES: dict[str, Prepare] = {"mbagent": on_machine, "mbagent, random play at leaves": with_rollouts}
-"""What is compared with the peers, by name."""
+"""The library's searches in the comparison, by name."""
 
 
 def time_search(search: TableSearch, roots: Ints, speeds: Sequence[tuple[int, int]], repetitions: int = 5) -> list[Speed]:
-    """Times a search as the peers' scripts do: processor time on one thread, the median after a call that may compile.
+    """Times a search as the peers' scripts do: processor time on one thread, the median after a first call that may compile.
 
-    A repetition is at least a hundredth of a second long: several calls, if need be.
+    A repetition lasts at least a hundredth of a second, with several calls if necessary.
     """
     found = []
     for n_roots, simulations in speeds:

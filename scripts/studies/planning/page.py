@@ -1,4 +1,4 @@
-"""The tables and the picture that the benchmark of planning ends in."""
+"""The tables and the picture of the planning benchmark."""
 
 from __future__ import annotations
 
@@ -13,66 +13,66 @@ Row: TypeAlias = Mapping[str, Any]
 
 TITLES = {
     "quality": "How well agents play with the default settings",
-    "crowds": "Worlds of many noisy variables, too large to solve",
-    "decisions": "What a decision costs beside a forward pass of PPO",
+    "crowds": "Many noisy variables, too large to solve",
+    "decisions": "Cost of a decision compared with a forward pass of PPO",
     "start": "The first decision of a new process",
     "memory": "Memory over many decisions",
-    "regret": "What searches lose, against the number of simulations",
-    "speed": "Speed of searches on a table",
+    "regret": "Regret of searches against the number of simulations",
+    "speed": "Speed of searches in tabular MDPs",
     "naive": "One sampled next state: the naive procedure and the compiled samplers",
-    "short cut": "Resampling only what is uncertain",
-    "networks": "Searches through learned networks",
-    "equal regret": "Searches through learned networks: processor time to regret as low as mctx's",
+    "short cut": "Resampling of the uncertain variables only",
+    "networks": "Searches with learned networks",
+    "equal regret": "Searches with learned networks: processor time to the same regret as mctx",
 }
-"""What each table is called."""
+"""Titles of the tables."""
 
 NOTES = {
-    "quality": "Normalised return: 0 random play, 1 the optimum or the best player known; interquartile mean over agents and "
-    "episodes, with its bootstrap interval. Of tables the exact value of what the agent does.",
+    "quality": "Normalised return: 0 is random play, 1 the optimum or the best known player; interquartile mean over agents and "
+    "episodes, with its bootstrap interval. For tabular MDPs, the exact value of the agent's policy.",
     "crowds": "Return of 40 steps, true rules, mean over 16 episodes with its standard error; lookahead: the default planner "
-    "without learned values. What is done once for a goal is timed apart.",
-    "decisions": "Median processor time on one core about single observations, none met twice. The reward is the game's own, or "
-    "the same as a plain Python function; what is done once for a goal (the reachable machine, if it is small) is timed apart.",
+    "without fitted leaf values. Work done once per goal is timed separately.",
+    "decisions": "Median processor time on one core for single, distinct observations. The reward is the game's own, or an "
+    "equivalent plain Python function; work done once per goal (the reachable MDP, if it is small) is timed separately.",
     "start": "Processor time in a new process, after imports, with everything compiled by an earlier one. The first decision "
-    "holds what is done once for a goal.",
-    "memory": "Memory that the process holds after a tenth of the decisions and in the end.",
-    "regret": "Random worlds of 25 states and 4 actions with exact values known; every search gets the same crude leaf values "
-    "(exact value plus noise as large as the values' spread), but for searches by random play. 1 is what a random action loses, "
-    "0 is perfect; error: standard error over worlds. At most 15 steps deep in mctx.",
-    "speed": "Processor time on one core, the median of several calls. Only ratios within one run mean something. A "
-    "simulation of mbagent's search on a known machine is at most 3 steps, with the machine's own probabilities; with random "
-    "play it goes on to the horizon; a peer's ends where its tree does. A node of "
-    "chance is a simulation of its own in Stochastic MuZero.",
-    "naive": "Microseconds of processor time for one state. Naive: a full forward pass of predictor and conditioner in torch for "
-    "every variable. bar: the ratio asked for.",
-    "short cut": "Full: all variables redrawn in every sweep; short: those to which the predictor gives between 2% and 98%, and "
-    "of the others those whose random number lies so far out that the conditioner could matter. begun: what both begin with. "
-    "uncertain: variables between 2% and 98%; (d + 1) / uncertain is the most that could be saved. Total variation between "
-    "the two is at most same_luck, the share of whole next states that differ under the same random numbers; bound: its 95% "
+    "includes the work done once per goal.",
+    "memory": "Memory of the process after a tenth of the decisions and at the end.",
+    "regret": "Random MDPs with 25 states, 4 actions and known exact values; all searches get the same crude leaf values (exact "
+    "values plus noise of the same standard deviation), except those with random rollouts. 1 is the regret of a random action, "
+    "0 is perfect; error: standard error over MDPs. The depth in mctx is at most 15 steps.",
+    "speed": "Processor time on one core, the median of several calls. Only ratios within one run are meaningful. A "
+    "simulation of mbagent's search in a known MDP has at most 3 steps, with the MDP's exact probabilities; with random "
+    "rollouts it continues to the horizon; a peer's ends at the leaf of its tree. In Stochastic MuZero, a chance node takes a "
+    "simulation of its own.",
+    "naive": "Microseconds of processor time per state. Naive: a full forward pass of predictor and conditioner in torch for "
+    "every variable. bar: the required ratio.",
+    "short cut": "Full: all variables are resampled in every sweep; short: only those with predicted probabilities between 2% "
+    "and 98%, and others with random numbers so extreme that the conditioner could matter. begun: the initial work of both. "
+    "uncertain: variables between 2% and 98%; (d + 1) / uncertain bounds the possible speed-up. Total variation between "
+    "the two is at most same_luck, the share of whole next states that differ with the same random numbers; bound: its 95% "
     "limit. joint and pairs: estimates from frequencies with other random numbers; floor: the same estimate for two runs of the "
     "full sweep, whose total variation is 0. Means over inputs.",
     "networks": "GeyserRunner with 30 bits, learned: the same predictor and causal conditioner for both. Regret against exact "
-    "values of the true game: with its own goal, and with a random income in each column (mean over goals); 1 is what a random "
-    "action loses. Times of a decision, from one root and from 16 at once. mctx draws a next state in every simulation; mbagent "
-    "keeps what it has imagined of a state, and searches on in it. Pruned: the same networks, at least nine in ten "
-    "connections gone, compiled to what is left.",
-    "equal regret": "The cheapest effort of mbagent that loses no more than mctx with a budget under the random goals.",
+    "values of the true game: with its own goal, and with random rewards of the columns (mean over goals); 1 is the regret of a "
+    "random action. Times per decision, for one root and for 16 at once. mctx samples a next state in every simulation; mbagent "
+    "keeps the expanded successors of a state and searches in them. Pruned: the same networks without at least nine in ten "
+    "connections, compiled for the remaining ones.",
+    "equal regret": "The cheapest effort of mbagent with no more regret than mctx with a given budget, under the random goals.",
 }
-"""What each table's figures mean."""
+"""Explanations of the tables."""
 
 COLOURS = ("#0b6e4f", "#58b368", "#d1495b", "#edae49", "#3b7ea1", "#9aa5b1")
-"""The library's own searches come first."""
+"""Sort key that places the library's own searches first."""
 
 
 def shown(value: Any) -> str:
-    """A cell of a table."""
+    """Formats a cell of a table."""
     if isinstance(value, float):
         return format_number(value, 4 if abs(value) < 1 else 2 if abs(value) < 100 else 0)
     return f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def draw_regret(rows: Sequence[Row]) -> bytes:
-    """Regret against simulations for each search, a panel for each kind of world."""
+    """Plots regret against simulations for each search, with a panel for each kind of MDP."""
     searches = list(dict.fromkeys(row["search"] for row in rows))
     ticks = {n: f"{n}" for n in sorted({row["simulations"] for row in rows})}
     panels: list[Panel] = []
@@ -88,12 +88,12 @@ def draw_regret(rows: Sequence[Row]) -> bytes:
 
 
 def write_page(path: Path, tables: Mapping[str, Sequence[Row]], command: str) -> dict[str, bytes]:
-    """Writes the page with everything measured; returns its pictures by name.
+    """Writes the page with all results; returns its pictures by name.
 
     Args:
-        path: of the page.
-        tables: rows by name, see ``TITLES``; empty ones are left out.
-        command: that was run.
+        path: path of the page.
+        tables: rows by name, see ``TITLES``; empty ones are skipped.
+        command: the command line that was run.
     """
     full = {name: list(tables[name]) for name in TITLES if tables.get(name)}
     pictures = {"regret": draw_regret(full["regret"])} if "regret" in full else {}
@@ -101,6 +101,6 @@ def write_page(path: Path, tables: Mapping[str, Sequence[Row]], command: str) ->
         Section(TITLES[name], [Card(figure=pictures.get(name), table=Table.of(rows, shown), notes=[NOTES[name]])])
         for name, rows in full.items()
     ]
-    intro = "Every table is of one run on one machine."
+    intro = "The values of each table are from one run on one machine."
     Page("Planning", "Speed and quality of planning and sampling", intro, sections, command, {}).write(path)
     return pictures

@@ -1,4 +1,4 @@
-"""Other packages' searches, run by a Python of their own (``pip install "mbagent[peers]"`` there, or the names in it)."""
+"""Searches of other packages, run by a separate Python (with ``pip install "mbagent[peers]"``, or the packages in it)."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from mbagent.types import Ints
 from worlds.random_mdps import RandomMDP, save_mdp
 
 SCRIPTS = Path(__file__).parents[2] / "peers"
-"""The scripts that run them, in the source tree."""
+"""Folder of the scripts that run them, in the source tree."""
 
 PEERS = ("mctx_search", "lightzero_search", "gymcts_search")
-"""Those that search table worlds."""
+"""Scripts that search in tabular MDPs."""
 
 SLOW = {"gymcts_search": 1024}
-"""Most simulations asked of a peer that would take minutes for more."""
+"""Largest budget of a peer that would take minutes for more."""
 
 SPEEDS = ((1, 256), (1, 1024), (16, 1024))
-"""(roots, simulations) at which searches are timed."""
+"""(roots, simulations) with which searches are timed."""
 
 
 @dataclass(frozen=True)
 class Speed:
-    """How fast a search is.
+    """Speed of a search.
 
     Attributes:
-        roots: searched at once.
-        simulations: for each root.
-        seconds: processor time of a call, the median of several, on one core.
-        simulations_per_second: over all roots.
-        samples_per_second: next states drawn from the model, over all roots.
+        roots: number of roots searched at once.
+        simulations: simulations for each root.
+        seconds: median processor time per call, on one core.
+        simulations_per_second: simulations over all roots.
+        samples_per_second: next states sampled from the model, over all roots.
     """
 
     roots: int
@@ -50,12 +50,12 @@ class Speed:
 
 @dataclass(frozen=True)
 class PeerResult:
-    """What a peer did.
+    """Results of a peer.
 
     Attributes:
-        name: of the search.
+        name: name of the search.
         choices: budget -> actions int64 [seeds, R].
-        speeds: what was timed.
+        speeds: measured speeds.
     """
 
     name: str
@@ -64,16 +64,16 @@ class PeerResult:
 
 
 class PeerError(RuntimeError):
-    """A peer did not run; the message is the last line of what it said."""
+    """A peer failed; the message is the last line of its output."""
 
 
 def run_script(python: Path, script: str, arguments: Sequence[str], timeout: float = 3600.0) -> Any:
     """Runs a script of ``scripts/peers`` and returns the JSON it prints.
 
     Raises:
-        PeerError: it failed.
+        PeerError: the script failed.
     """
-    # The scripts are all that the peers' Python is shown of this repository.
+    # The peers' Python sees only these scripts of this repository.
     environment = {**os.environ, "PYTHONPATH": str(SCRIPTS.parent)}
     command = [str(python), str(SCRIPTS / f"{script}.py"), *arguments]
     try:
@@ -96,20 +96,20 @@ def run_peer(
     speeds: Sequence[tuple[int, int]] = (),
     repetitions: int = 5,
 ) -> list[PeerResult]:
-    """Lets a peer choose actions in a world, and times it.
+    """Lets a peer choose actions in an MDP, and times it.
 
     Args:
-        python: of the environment that has the peer.
+        python: Python interpreter of the peer's environment.
         script: one of ``PEERS``.
-        world: what is searched; several worlds as ``side_by_side`` makes one of them.
-        roots: int64 [R].
+        world: the MDP; several are combined by ``side_by_side``.
+        roots: roots, int64 [R].
         budgets: simulations for each root.
-        seeds: each budget is used once with each.
+        seeds: each budget is used once with each seed.
         speeds: (roots, simulations) to time.
-        repetitions: timed calls of each, after one that may compile.
+        repetitions: timed calls of each, after a first one that may compile.
 
     Raises:
-        PeerError: it failed.
+        PeerError: the script failed.
     """
     most = SLOW.get(script, max(budgets, default=0))
     with tempfile.TemporaryDirectory() as folder:
@@ -123,12 +123,12 @@ def run_peer(
             speeds=np.array(speeds, dtype=np.int64).reshape(-1, 2),
             repetitions=np.array(repetitions),
         )
-        told = run_script(python, script, [str(path)])
+        output = run_script(python, script, [str(path)])
     return [
         PeerResult(
             name,
             {int(n): np.array(actions, dtype=np.int64) for n, actions in result["choices"].items()},
             [Speed(**speed) for speed in result["speeds"]],
         )
-        for name, result in told.items()
+        for name, result in output.items()
     ]

@@ -1,4 +1,4 @@
-"""How well agents play: with the true model, and with a learned one, against the optimum or the best player known."""
+"""Returns of agents with the true and with a learned model, compared with the optimum or the best known player."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ GAMES = ("geyser_deterministic", "geyser_low_cost", "geyser_high_cost", "flier_c
 """Cases that are games."""
 
 TOY_TEXT = {"FrozenLake 4x4": 100, "FrozenLake 8x8": 100, "CliffWalking": 200, "Taxi": 200}
-"""Gymnasium's tables, and the steps of an episode."""
+"""Gymnasium's tabular MDPs, with the steps of an episode."""
 
 EPISODES, SCALE_EPISODES, STEPS = 20, 300, 50_000
-"""Episodes of a seed; episodes that the scale is measured with; steps learned from."""
+"""Episodes per seed; episodes for measuring the scale; steps for learning."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class Played:
     Attributes:
         world: its name.
         model: "true" or "learned".
-        seed: of the agent.
-        scores: normalised return of each episode; of a table, of its exact value.
+        seed: seed of the agent.
+        scores: normalised return of each episode; for a tabular MDP, the normalised exact value.
         value: mean return.
-        reference: return that counts as 1.
+        reference: return that corresponds to 1.
     """
 
     world: str
@@ -51,7 +51,7 @@ class Played:
 
 
 def play_table(name: str, seed: int) -> Played:
-    """Plays a table with its true model; the value of what the agent does is computed exactly."""
+    """Plans in a tabular MDP with its true model; the value of the agent's policy is computed exactly."""
     env = find_world(name).make(max_episode_steps=TOY_TEXT[name])
     model, reward = toy_text_model(env)
     agent = ModelLearningAgent("MctsPolicy", env, model=model, reward=reward, seed=seed)
@@ -62,7 +62,7 @@ def play_table(name: str, seed: int) -> Played:
 
 
 def play_game(key: str, seed: int, learned: bool, scale: Scale, episodes: int = EPISODES, steps: int = STEPS) -> Played:
-    """Plays a game with its true model, or with one learned from ``steps`` steps, by the agent's default settings."""
+    """Plays a game with its true model, or with one learned from ``steps`` steps, with the agent's default settings."""
     case, game = find_case(key), find_case(key).game
     assert game is not None
     if learned:
@@ -84,7 +84,7 @@ def scales(say: Callable[[str], None]) -> dict[str, Scale]:
 
 
 def summary(played: list[Played]) -> Row:
-    """One world's and model's agents in a row."""
+    """Row that summarises the agents of one world and model."""
     first = played[0]
     scores = np.stack([agent.scores for agent in played])
     interval = interquartile_interval(scores)

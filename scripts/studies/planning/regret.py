@@ -1,4 +1,4 @@
-"""How much searches lose against the number of simulations, and how fast they are, on the same worlds."""
+"""Regret of searches against the number of simulations, and their speed, in the same MDPs."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from worlds.random_mdps import N_STATES, Kind, RandomMDP, choose_roots, random_m
 
 @dataclass(frozen=True)
 class Settings:
-    """What to compare on.
+    """Settings of the comparison.
 
     Attributes:
-        worlds: of each kind.
-        roots: in each world.
-        seeds: searches from each root with each budget.
-        first_seed: of the worlds and searches.
-        budgets: simulations.
-        peers_python: of the environment that has the peers; None: they are left out.
-        repetitions: timed calls.
+        worlds: number of MDPs of each kind.
+        roots: number of roots in each MDP.
+        seeds: searches per root and budget.
+        first_seed: first seed of the MDPs and searches.
+        budgets: numbers of simulations.
+        peers_python: Python interpreter of the peers' environment; None skips the peers.
+        repetitions: number of timed calls.
     """
 
     worlds: int = 10
@@ -40,15 +40,15 @@ class Settings:
 
 @dataclass(frozen=True)
 class RegretRow:
-    """What a search loses with a budget on worlds of a kind.
+    """Regret of a search with a budget in MDPs of one kind.
 
     Attributes:
-        kind: of the worlds.
-        search: its name.
-        simulations: its budget.
-        regret: mean over worlds, roots and seeds, as a share of what a random action loses there: 0 is perfect.
-        error: standard error of the mean over worlds; roots and seeds of one world are not independent.
-        right: share of choices that lose nothing.
+        kind: kind of the MDPs.
+        search: name of the search.
+        simulations: budget of the search.
+        regret: mean over MDPs, roots and seeds, relative to that of a random action: 0 is perfect.
+        error: standard error of the mean over MDPs; roots and seeds of one MDP are not independent.
+        right: share of optimal choices.
     """
 
     kind: str
@@ -61,7 +61,7 @@ class RegretRow:
 
 @dataclass(frozen=True)
 class SpeedRow:
-    """How fast a search is: the figures of ``Speed``, and its name."""
+    """Speed of a search: the fields of ``Speed``, and its name."""
 
     search: str
     roots: int
@@ -72,12 +72,12 @@ class SpeedRow:
 
 @dataclass(frozen=True)
 class Arena:
-    """The worlds of one kind as one, and where to plan from.
+    """The MDPs of one kind combined into one, with the roots.
 
     Attributes:
-        world: all of them side by side.
-        roots: int64 [W * roots], world after world.
-        n_worlds: W.
+        world: the MDPs, combined by ``side_by_side``.
+        roots: roots int64 [W * roots], ordered by MDP.
+        n_worlds: number of MDPs W.
     """
 
     world: RandomMDP
@@ -86,12 +86,12 @@ class Arena:
 
 
 def build_arena(kind: Kind, settings: Settings) -> Arena:
-    """The worlds of a kind."""
+    """Creates the MDPs of one kind."""
     seeds = range(settings.first_seed, settings.first_seed + settings.worlds)
     worlds = [random_mdp(kind, seed) for seed in seeds]
     roots = [i * N_STATES + choose_roots(world, settings.roots, i) for i, world in enumerate(worlds)]
     if any(len(some) < settings.roots for some in roots):
-        raise ValueError(f"There are fewer than {settings.roots} roots in some world; ask for fewer.")
+        raise ValueError(f"Some MDP has fewer than {settings.roots} roots; choose fewer.")
     return Arena(side_by_side(worlds), np.concatenate(roots), settings.worlds)
 
 
@@ -108,12 +108,12 @@ def score(kind: str, search: str, simulations: int, arena: Arena, actions: Ints)
 def compare(
     settings: Settings, own: Mapping[str, Prepare] = OWN_SEARCHES, say: Callable[[str], None] = print
 ) -> tuple[list[RegretRow], list[SpeedRow]]:
-    """Runs all searches on all worlds.
+    """Runs all searches in all MDPs.
 
     Args:
-        settings: see there.
+        settings: settings of the comparison.
         own: the library's searches by name.
-        say: told what is being done, and which peers did not run.
+        say: called with progress messages and failures of peers.
     """
     regrets: list[RegretRow] = []
     speeds: list[SpeedRow] = []
@@ -122,7 +122,7 @@ def compare(
         say("Peers are left out: --peers-python is not given.")
     for number, kind in enumerate(get_args(Kind)):
         arena = build_arena(kind, settings)
-        # Times do not depend on what the rewards are: they are taken once.
+        # Times do not depend on the rewards, so they are measured once.
         timed = SPEEDS if number == 0 else ()
         for name, prepare in own.items():
             say(f"{kind} worlds: {name}")

@@ -1,4 +1,4 @@
-"""What one sampled next state costs: the naive procedure in torch, the compiled samplers, and their short cut."""
+"""Cost of one sampled next state: the naive procedure in torch, the compiled samplers, and their short cut."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ from mbagent_envs.random_keys import derive
 from worlds.synthetic_dbn import random_inputs
 
 TRUSTED = 0.98
-"""The short cut leaves a variable to the predictor where its likeliest value has at least this probability."""
+"""With the short cut, variables whose most likely value has at least this probability are sampled from the predictor."""
 
 EVERYTHING = 1.1
-"""No variable is left to the predictor."""
+"""No variable is sampled from the predictor only."""
 
 BARS_NAIVE = {1: 100.0, 64: 25.0, 4096: 25.0}
-"""How many times the naive procedure's speed is asked for at each batch size, for d = 32."""
+"""Required speed relative to the naive procedure at each batch size, for d = 32."""
 
 BARS_SHORT_CUT = {32: 8.0, 128: 40.0}
-"""How many times the full sweep's speed is asked of the short cut for each d."""
+"""Required speed of the short cut relative to the full sweep for each d."""
 
 BAR_VARIATION = 0.01
-"""The most total variation allowed between the two."""
+"""Largest allowed total variation between the two."""
 
 
 @dataclass(frozen=True)
 class SpeedUp:
-    """The compiled samplers beside the naive procedure.
+    """A compiled sampler compared with the naive procedure.
 
     Attributes:
         sampler: see ``build_sampler``.
         d: number of bits.
-        batch: states at once.
-        naive: microseconds of processor time for one sampled state.
-        compiled: the same.
-        ratio: of the two.
-        bar: what was asked for; nan where nothing was.
+        batch: batch size.
+        naive: microseconds of processor time per sampled state.
+        compiled: the same for the compiled sampler.
+        ratio: ratio of the two.
+        bar: required ratio; nan if there is none.
     """
 
     sampler: str
@@ -58,26 +58,26 @@ class SpeedUp:
 
 @dataclass(frozen=True)
 class ShortCut:
-    """Resampling only the uncertain variables beside the full sweep.
+    """Resampling of the uncertain variables only, compared with the full sweep.
 
     Attributes:
         d: number of bits.
         sweeps: passes over the variables.
-        uncertain: variables that the predictor leaves open, mean over inputs. With everything else for nothing, the short cut
-            could be at most variables / uncertain times as fast.
-        full: microseconds of processor time for one sampled state.
-        short: the same.
-        begun: the same for what both begin with: predictor, first guess, and the first sums of the uncertain variables.
-        ratio: of full and short.
-        bar: what was asked for.
-        same_luck: share of draws that differ under the same random numbers. Two variables differ with at least the probability
-            that is their laws' total variation, however they are coupled: so this is an upper bound of the total variation
-            of the whole next state, without any noise that would add to it.
-        bound: 95% confidence limit of ``same_luck`` from finitely many draws.
-        joint: total variation estimated from frequencies, of the short cut and the full sweep with other random numbers.
-        floor: the same estimate from two runs of the full sweep, whose total variation is 0: what luck alone adds.
-        pairs: as ``joint``, of two variables, mean over all pairs.
-        pairs_floor: as ``floor``, of pairs.
+        uncertain: variables that are uncertain by the predictor, mean over inputs. If everything else cost nothing, the short
+            cut would be variables / uncertain times as fast.
+        full: microseconds of processor time per state sampled by the full sweep.
+        short: the same for the short cut.
+        begun: the same for the initial work of both: predictor, first guess, and the first sums of the uncertain variables.
+        ratio: ratio of full and short.
+        bar: required ratio.
+        same_luck: share of samples that differ with the same random numbers. In any coupling, two random variables differ with
+            at least the probability given by the total variation of their distributions; so this is an upper bound of the
+            total variation of the whole next state, without additional sampling noise.
+        bound: 95% confidence limit of ``same_luck`` for the finite number of samples.
+        joint: total variation between the short cut and the full sweep, estimated from frequencies with other random numbers.
+        floor: the same estimate for two runs of the full sweep, whose total variation is 0: the effect of sampling noise.
+        pairs: as ``joint``, for pairs of variables, mean over all pairs.
+        pairs_floor: as ``floor``, for pairs.
     """
 
     d: int
@@ -98,16 +98,16 @@ class ShortCut:
 
 @torch.inference_mode()
 def naive_sample(model: NeuralTransitionModel, states: Ints, actions: Ints, seed: int) -> Ints:
-    """The procedure as one would first write it: a full forward pass of both networks for each variable that is drawn.
+    """The straightforward procedure: a full forward pass of both networks for each sampled variable.
 
     Args:
-        model: of bits, with a conditioner; one pass over the variables, in order.
-        states: int64 [B, F].
-        actions: int64 [B].
-        seed: of the draws.
+        model: model of bits with a conditioner; one pass over the variables, in order.
+        states: states int64 [B, F].
+        actions: actions int64 [B].
+        seed: seed of the samples.
 
     Returns:
-        Draws int64 [B, F + 1], ``terminated`` last.
+        Samples int64 [B, F + 1], ``terminated`` last.
     """
     assert model.conditioner is not None
     generator = torch.Generator().manual_seed(seed)
@@ -124,7 +124,7 @@ def naive_sample(model: NeuralTransitionModel, states: Ints, actions: Ints, seed
 
 @contextmanager
 def using(model: NeuralTransitionModel, certain: float, sweeps: int, pruned_as: PrunedAs = "matrices") -> Iterator[None]:
-    """The model with other settings of its sampler; where it is pruned, drawn from its whole matrices or as told."""
+    """Uses other settings of the model's sampler; ``pruned_as`` selects how a pruned model is sampled."""
     before = model.config, model.pruned_as
     model.config, model.pruned_as = replace(model.config, certain=certain, sweeps=sweeps), pruned_as
     try:
@@ -134,7 +134,7 @@ def using(model: NeuralTransitionModel, certain: float, sweeps: int, pruned_as: 
 
 
 def microseconds(call: Callable[[], object], rows: int, at_least: float = 0.3, repetitions: int = 5) -> float:
-    """Processor time of one row, the median over repetitions of at least so many seconds in all; the first call is not timed."""
+    """Processor time per row, as median over repetitions that last ``at_least`` seconds in all; the first call is not timed."""
     call()
     began = time.process_time()
     call()
@@ -150,7 +150,7 @@ def microseconds(call: Callable[[], object], rows: int, at_least: float = 0.3, r
 
 
 def compare_with_naive(model: NeuralTransitionModel, sampler: str, batches: Sequence[int], seed: int) -> list[SpeedUp]:
-    """The model's own ``sample``, with all its wrapping, beside the naive procedure."""
+    """The model's own ``sample``, with its overhead, compared with the naive procedure."""
     d, rng, rows = len(model.cardinalities), np.random.default_rng(seed), []
     for batch in batches:
         states, actions = random_inputs(d, batch, rng)
@@ -163,7 +163,7 @@ def compare_with_naive(model: NeuralTransitionModel, sampler: str, batches: Sequ
 
 
 def total_variation(first: Ints, second: Ints) -> float:
-    """Between two samples of outcomes, int64 [N, V] each: half the sum of the differences of their frequencies."""
+    """Total variation between two samples of outcomes, int64 [N, V] each, from their frequencies."""
     both = np.ascontiguousarray(np.concatenate([first, second]).astype(np.int8))
     _, number = np.unique(both.view(np.dtype((np.void, both.shape[1]))).ravel(), return_inverse=True)
     counts = [np.bincount(part, minlength=number.max() + 1) / len(part) for part in np.split(number, [len(first)])]
@@ -181,14 +181,14 @@ def pair_variations(first: Ints, second: Ints) -> Floats:
 
 
 def compare_short_cut(model: NeuralTransitionModel, sweeps: int, seed: int, n_inputs: int, n_draws: int) -> ShortCut:
-    """The full sweeps beside those over uncertain variables only: their cost, and how far their distributions are apart.
+    """Full sweeps compared with sweeps over uncertain variables only: cost, and distance of their distributions.
 
     Args:
-        model: with a conditioner masked "others".
-        sweeps: passes.
-        seed: of inputs and draws.
-        n_inputs: states and actions on which distributions are compared; variations are means over them.
-        n_draws: from each.
+        model: model with a conditioner masked "others".
+        sweeps: number of passes.
+        seed: seed of inputs and samples.
+        n_inputs: number of states and actions for which distributions are compared; results are means over them.
+        n_draws: samples for each input.
     """
     d, rng = len(model.cardinalities), np.random.default_rng(seed)
     states, actions = random_inputs(d, 1024, rng)
@@ -209,13 +209,13 @@ def compare_short_cut(model: NeuralTransitionModel, sweeps: int, seed: int, n_in
 
 
 def upper_limit(share: float, n: int) -> float:
-    """The largest probability, to 95% confidence, of what has happened in this share of n trials (Clopper and Pearson 1934)."""
+    """Upper 95% confidence limit of the probability of an event with this share in n trials (Clopper and Pearson 1934)."""
     hits = round(share * n)
     return 1.0 if hits >= n else float(stats.beta.ppf(0.95, hits + 1, n - hits))
 
 
 def _apart(model: NeuralTransitionModel, sweeps: int, state: Ints, action: np.int64, seed: int, n: int) -> tuple[float, ...]:
-    """For one input: share of draws that differ, joint total variation and its floor, and these two for the mean pair."""
+    """For one input: share of samples that differ, joint total variation and its floor, and these two for the mean pair."""
     given = np.tile(state, (n, 1)), np.full(n, action)
     draws = []
     for certain, run in ((EVERYTHING, 0), (TRUSTED, 0), (EVERYTHING, 1)):

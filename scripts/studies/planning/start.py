@@ -1,4 +1,4 @@
-"""How long the first decision of a new process takes, with everything compiled by an earlier one, imports apart."""
+"""Time of the first decision in a new process without imports, with everything compiled by an earlier process."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mbagent.agent import ModelLearningAgent
 from worlds.games import find_case
 
 SCRIPTS = Path(__file__).parents[2]
-"""Where the modules of the studies are found."""
+"""Folder of the studies' modules."""
 
 GAMES = ("geyser_deterministic", "flier_catcher", "maneuverer")
 
@@ -39,10 +39,10 @@ print(json.dumps([loaded - began, first - loaded, time.process_time() - first]))
 
 
 def first_decisions(key: str, seed: int, steps: int = 5000) -> list[Row]:
-    """Seconds of processor time that a learned agent takes for loading, its first decision and its second, in a new process.
+    """Processor time in seconds of loading, the first and the second decision of a learned agent in a new process.
 
-    The first decision holds what is done once for a goal: solving the machine, or learning values for it. Rows: with the game's
-    own reward, and, where the agent is loaded without an environment, with the reward that it learned.
+    The first decision includes the work done once per goal: solving the MDP, or fitting a value function. Rows: with the game's
+    own reward, and with the learned reward, for which the agent is loaded without an environment.
 
     Raises:
         RuntimeError: a process failed.
@@ -63,7 +63,7 @@ def first_decisions(key: str, seed: int, steps: int = 5000) -> list[Row]:
 
 
 def _timed(command: list[str]) -> list[float]:
-    """What a process prints, run for the second time: the first one compiles what has not been compiled yet."""
+    """Output of the second run of a process; the first run compiles whatever is not compiled yet."""
     path = os.pathsep.join([str(SCRIPTS), *filter(None, [os.environ.get("PYTHONPATH")])])
     for _ in range(2):
         done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": path})

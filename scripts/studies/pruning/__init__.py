@@ -1,1 +1,1 @@
-"""What is left of networks after pruning (the paper's section 5)."""
+"""Pruned networks and their structure (the paper's section 5)."""

@@ -1,4 +1,4 @@
-"""Learns a game on flat variables, prunes to one share after another, and measures what is left."""
+"""Learns a game on flat variables, prunes to increasing shares, and measures the pruned networks."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from worlds.games import Case, find_case, play
 from worlds.known_rules import Scale, scale_of
 
 Networks: TypeAlias = Literal["causal", "paper"]
-"""The default networks, or the paper's own: both on flat variables."""
+"""The default networks or the paper's own, both on flat variables."""
 
 Way: TypeAlias = Literal["by size", "by evidence"]
-"""The smallest weights alone, as in the paper; or also what the transitions do not call for, the default."""
+"""Remove the smallest weights only, as in the paper, or also those that the transitions do not support (the default)."""
 
 Key: TypeAlias = tuple[float, Way]
-"""Share of the connections to remove, and how."""
+"""Share of the connections to remove, and the method."""
 
 GAMES = ("flier_catcher", "geyser_high_cost", "maneuverer")
 FRACTIONS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99)
@@ -35,17 +35,17 @@ FRACTIONS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99)
 
 @dataclass(frozen=True)
 class Settings:
-    """What to run.
+    """Settings of the experiment.
 
     Attributes:
         games: keys of ``cases``.
         fractions: shares of the connections to remove.
-        ways: see Way.
+        ways: pruning methods, see Way.
         networks: see Networks.
         timesteps: steps of random play to learn from.
         seeds: number of repetitions.
-        first_seed: seed of the first.
-        episodes: for each agent, the same for all shares; 0: none are played.
+        first_seed: seed of the first repetition.
+        episodes: episodes for each agent, the same for all shares; 0 for none.
 
     Raises:
         ValueError: a setting is out of range.
@@ -74,22 +74,22 @@ class Settings:
 
 @dataclass(frozen=True)
 class Row:
-    """One agent, pruned to one share in one way.
+    """One agent, pruned to one share by one method.
 
     Attributes:
-        game, seed, fraction, way: which; the share 0 stands for the agent before pruning.
-        connections: that are left.
-        gone: share of the connections that are gone.
-        returned: normalised return; nan where none was played.
-        log_likelihood: excess nats a transition over the true model's, on play that was not learned from; nan where the true
-            one has none.
+        game, seed, fraction, way: identification; the share 0 stands for the agent before pruning.
+        connections: remaining connections.
+        gone: share of the removed connections.
+        returned: normalised return; nan if no episodes were played.
+        log_likelihood: loss in nats per transition relative to the true model, on unseen play; nan if the true model has no
+            exact probabilities.
         marginal: total variation of single variables from the true ones, mean over variables and inputs.
         full, matrices, connected, used, variation: see ``measures.Speeds``.
-        parents: state variables that a variable hangs on, mean; before pruning, all that a path leads from.
-        precision, recall: of these; nan where the truth is not written down.
-        conditions_precision, conditions_recall: of those between next variables.
+        parents: mean number of parents of a variable; before pruning, all variables connected to it by a path.
+        precision, recall: precision and recall of the parents; nan if the true ones are not known.
+        conditions_precision, conditions_recall: the same for dependencies between next variables.
         modules: share of the true modules, and groups of dependent variables, that are found exactly.
-        seconds: of pruning and training.
+        seconds: time of pruning and training.
     """
 
     game: str
@@ -126,18 +126,18 @@ class Cell:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a cell found.
+    """Results of a cell.
 
     Attributes:
-        cell: which.
-        names: of the state variables.
+        cell: the cell.
+        names: names of the state variables.
         actions: names of the actions.
-        rows: one for each share and way.
-        returns: normalised return of each episode, the same episodes in each.
+        rows: one for each share and method.
+        returns: normalised return of each episode, with the same episodes for each share and method.
         influences: sums over all paths.
-        linked: sums over those that make a difference.
+        linked: sums over the paths with an effect.
         modules, groups: a line for each module and each group of dependent variables.
-        others: microseconds of a next state by other networks, see ``measures.measure_others``.
+        others: microseconds per next state for other networks, see ``measures.measure_others``.
     """
 
     cell: Cell
@@ -159,7 +159,7 @@ def cells(settings: Settings) -> list[Cell]:
 
 
 def run_cell(cell: Cell) -> Result[Cell]:
-    """Learns once, and prunes the same learned agent to each share in each way; ``arrays["outcome"]`` is the ``Outcome``."""
+    """Learns once, and prunes the same learned agent to each share with each method; ``arrays["outcome"]`` is the ``Outcome``."""
     case = find_case(cell.game)
     env, settings = case.make_env(), cell.settings
     space, n_actions = FactoredSpace(env.observation_space), ActionEnumeration(env.action_space).n
@@ -185,7 +185,7 @@ def run_cell(cell: Cell) -> Result[Cell]:
 def _measure(
     key: Key, case: Case, scale: Scale, agent: mbagent.ModelLearningAgent, model: NeuralTransitionModel, outcome: Outcome
 ) -> None:
-    """Everything about one pruned agent, added to the outcome."""
+    """Measures one pruned agent and adds the results to the outcome."""
     cell, report, found, game = outcome.cell, agent.fit_report, influence(model, effective=True), case.game
     assert game is not None
     outcome.returns[key] = _play(cell, case, scale, agent)
@@ -212,7 +212,7 @@ def _measure(
 
 
 def _play(cell: Cell, case: Case, scale: Scale, agent: mbagent.ModelLearningAgent) -> Floats:
-    """Normalised returns of the episodes, the same ones whatever the agent."""
+    """Normalised returns of the episodes, which are the same for all agents."""
     episodes = cell.settings.episodes
     if not episodes:
         return np.zeros(0)

@@ -1,4 +1,4 @@
-"""How well a learned model knows its game, and what a sampled next state costs."""
+"""Accuracy of a learned model, and the cost of a sampled next state."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from worlds.games import Case
 from worlds.synthetic_dbn import random_data, random_inputs, trained
 
 ROWS = 1024
-"""States that are drawn from at once when it is timed."""
+"""Batch size for timing."""
 
 CONDITIONED, PAPER = "every variable conditioned", "the paper's networks, 5 sweeps"
-"""Networks of the same game that are timed beside the learned ones."""
+"""Other networks for the same game that are timed for comparison."""
 
 
 class Speeds(NamedTuple):
-    """Microseconds of processor time of a sampled next state.
+    """Microseconds of processor time per sampled next state.
 
     Attributes:
-        full: by whole matrices, every variable asked of the conditioner that has a group there.
-        matrices: by whole matrices, without what the predictor is sure of.
-        connections: by lists of what is left.
-        used: as the model is sampled from: by tables, and by lists where a variable has too many parents.
-        variation: upper bound of the total variation between the last and ``matrices``: 95% limit of the share of draws that
-            differ under the same random numbers.
+        full: with whole matrices, where every variable with a group in the conditioner is sampled from it.
+        matrices: with whole matrices, without the variables of which the predictor is certain.
+        connections: with lists of the remaining connections.
+        used: as the model is actually sampled: with tables, and with lists for variables with too many parents.
+        variation: upper bound of the total variation between ``used`` and ``matrices``: 95% limit of the share of samples that
+            differ with the same random numbers.
     """
 
     full: float
@@ -43,7 +43,7 @@ class Speeds(NamedTuple):
 
 
 def measure_speeds(model: NeuralTransitionModel, states: Any, actions: Any, seed: int) -> Speeds:
-    """Of a model, on states int64 [B, F] and actions int64 [B]."""
+    """Speeds of a model on states int64 [B, F] and actions int64 [B]."""
     keys, few = derive(seed, np.arange(len(states))), slice(0, ROWS)
 
     def timed(certain: float, pruned_as: PrunedAs) -> float:
@@ -66,7 +66,7 @@ def measure_speeds(model: NeuralTransitionModel, states: Any, actions: Any, seed
 
 
 def measure_others(model: NeuralTransitionModel, states: Any, actions: Any, seed: int) -> dict[str, float]:
-    """What a next state costs by networks that condition every variable, as the paper's do; with random weights."""
+    """Cost of a next state for networks that condition every variable, as the paper's do; with random weights."""
     keys, found = derive(seed, np.arange(ROWS)), {}
     for name, config in ((CONDITIONED, NeuralConfig()), (PAPER, NeuralConfig.paper(len(model.cardinalities)))):
         other = NeuralTransitionModel(model.cardinalities, model.n_actions, config, seed=seed)
@@ -76,13 +76,13 @@ def measure_others(model: NeuralTransitionModel, states: Any, actions: Any, seed
 
 
 class SizeRow(NamedTuple):
-    """A world of d bits, of which few are ever open, learned and pruned.
+    """A synthetic DBN of d bits, few of which are ever random, learned and pruned.
 
     Attributes:
-        d, seed: which.
-        connections: that are left.
-        whole: microseconds of a next state before pruning.
-        pruned: after it.
+        d, seed: identification.
+        connections: remaining connections.
+        whole: microseconds per next state before pruning.
+        pruned: the same after pruning.
     """
 
     d: int
@@ -93,7 +93,7 @@ class SizeRow(NamedTuple):
 
 
 def measure_size(d: int, seed: int, fraction: float = 0.9) -> SizeRow:
-    """Learns, prunes and times a world of d bits."""
+    """Learns, prunes and times a synthetic DBN of d bits."""
     model, data = trained("networks", d, seed), random_data(d, 6000, seed)
     states, actions = random_inputs(d, ROWS, np.random.default_rng([seed, d, 2]))
     call = partial(model.sample, states, actions, derive(seed, np.arange(ROWS)))
@@ -103,7 +103,7 @@ def measure_size(d: int, seed: int, fraction: float = 0.9) -> SizeRow:
 
 
 def unseen_play(case: Case, seed: int, n: int = 2000) -> tuple[Any, Any, Any]:
-    """States, actions and next states int64 of random play that no agent learns from."""
+    """States, actions and next states int64 of random play that is not used for learning."""
     game, rng = case.game, np.random.default_rng([seed, 77])
     assert game is not None
     obs, rows = game.initial(derive(seed, np.arange(n // 100), 7)), []
@@ -117,7 +117,7 @@ def unseen_play(case: Case, seed: int, n: int = 2000) -> tuple[Any, Any, Any]:
 
 
 def excess(case: Case, model: NeuralTransitionModel, states: Any, actions: Any, following: Any) -> float:
-    """Nats a transition that the model loses on the true distribution; nan where either has no exact probabilities."""
+    """Loss of the model in nats per transition relative to the true one; nan if either has no exact probabilities."""
     game, alive = case.game, np.zeros(len(states), dtype=np.bool_)
     assert game is not None
     try:
@@ -131,7 +131,7 @@ def excess(case: Case, model: NeuralTransitionModel, states: Any, actions: Any, 
 
 
 def marginal_error(case: Case, model: NeuralTransitionModel, states: Any, actions: Any, n_draws: int = 200) -> float:
-    """Total variation of single variables between draws of the model and of the game, mean over inputs and variables."""
+    """Total variation of single variables between samples of the model and of the game, mean over inputs and variables."""
     game = case.game
     assert game is not None
     row = np.repeat(np.arange(len(states)), n_draws)

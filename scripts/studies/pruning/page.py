@@ -1,4 +1,4 @@
-"""The curves, the figures 11 and 12 of the paper, and the page that the experiment ends in."""
+"""The curves, figures 11 and 12 of the paper, and the page of the experiment."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from worlds.games import find_case
 CURVES: dict[str, str] = {
     "returned": "normalised return",
     "marginal": "error of single variables (total variation)",
-    "log_likelihood": "nats a transition lost",
+    "log_likelihood": "nats lost per transition",
     "connections": "connections left",
-    "used": "µs for a next state, as used",
+    "used": "µs per next state, as used",
     "parents": "parents of a variable",
 }
-"""Fields of a row that are drawn against the pruned fraction."""
+"""Fields of a row that are plotted against the pruned fraction."""
 
 COLUMNS: dict[str, tuple[str, int]] = {
     "connections": ("Connections", 0),
@@ -50,7 +50,7 @@ COLUMNS: dict[str, tuple[str, int]] = {
     "modules": ("Modules found", 2),
     "seconds": ("Seconds", 1),
 }
-"""Fields of a row in the table, and what follows from several rows: title and digits."""
+"""Fields of a row, and values derived from several rows, in the table: title and digits."""
 
 COLOURS: dict[Way, str] = {"by size": "#9aa5b1", "by evidence": "#0b6e4f"}
 
@@ -58,7 +58,7 @@ Cells = dict[str, float]
 
 
 def summary(outcomes: Sequence[Outcome]) -> list[tuple[Key, Cells]]:
-    """Means over seeds for each share and way, the change of the return in the same episodes, and the speed-up."""
+    """Means over seeds for each share and method, the change of the return in the same episodes, and the speed-up."""
     result: list[tuple[Key, Cells]] = []
     rows = [row for outcome in outcomes for row in outcome.rows]
     first = rows[0].fraction, rows[0].way
@@ -103,7 +103,7 @@ def markdown_table(paths: Sequence[Path]) -> str:
 def write_page(
     path: Path, outcomes: Sequence[Outcome], settings: Settings, command: str, sizes: Sequence[SizeRow] = ()
 ) -> dict[str, bytes]:
-    """Writes the HTML page, pictures and all, into one file; returns the pictures as PNG by name."""
+    """Writes the HTML page with its pictures into one file; returns the pictures as PNG by name."""
     sections: list[Section] = []
     pictures: dict[str, bytes] = {}
     for game in settings.games:
@@ -114,24 +114,24 @@ def write_page(
             pictures |= {f"{game}_{name}": png for name, png in drawn.items()}
     if sizes:
         sections.append(_sizes(sizes))
-    Page("Pruning", "What is left after pruning", _intro(settings), sections, command, METHODS).write(path)
+    Page("Pruning", "Networks after pruning", _intro(settings), sections, command, METHODS).write(path)
     return pictures
 
 
 METHODS = {
     "Figures 11 and 12": "Sums of absolute weights over all paths from an input (x) to an output (y), on a square root scale, "
-    "first seed; without variables that nothing leads to or from in the end."
+    "first seed; without variables that have no links after pruning."
 }
 
 NOTE = (
     "Means over {} seed(s). Change: of the return in the same episodes, with the half-width of its 95% interval over episodes. "
-    "Nats lost: log-likelihood a transition below the true model's, on play that was not learned from. Error of single "
-    "variables: total variation between 200 draws of the model and of the game, which random draws alone make larger than 0. "
-    "µs: processor time of one next state in a batch of 1,024; all asked: every variable that has a group in the conditioner "
-    "is drawn from it; matrices and connections: without those that the predictor is sure of; as used: tables, and lists of "
-    "connections where a variable has too many parents. Times the speed: of the unpruned networks, all asked. Total variation: "
-    "between tables and whole matrices, upper 95% limit. Parents: state variables that a variable depends on. Precision and "
-    "recall: of these against the true dependencies. Modules found: share of the true ones, found exactly."
+    "Nats lost: difference to the true model's log-likelihood per transition, on unseen play. Error of single variables: "
+    "total variation between 200 samples of the model and of the game, which sampling noise alone makes larger than 0. "
+    "µs: processor time of one next state in a batch of 1,024; all asked: every variable with a group in the conditioner "
+    "is sampled from it; matrices and connections: without those of which the predictor is certain; as used: tables, and lists "
+    "of connections for variables with too many parents. Times the speed: of the unpruned networks, all asked. Total "
+    "variation: between tables and whole matrices, upper 95% limit. Parents: state variables that a variable depends on. "
+    "Precision and recall: of these against the true dependencies. Modules found: share of the true ones, found exactly."
 )
 
 
@@ -139,10 +139,10 @@ def _intro(settings: Settings) -> str:
     own = ", the paper's own" if settings.networks == "paper" else ""
     plays = f" and plays the same {settings.episodes} episodes each time" if settings.episodes else ""
     return (
-        "The smallest weights of predictor and conditioner are removed, a few at a time, while what is left is trained on "
+        "The smallest weights of predictor and conditioner are removed, a few at a time, while training of the others continues "
         f"(section 5 of Braylan and Miikkulainen 2015). Networks on flat variables{own}, learned from {settings.timesteps:,} "
-        f"steps of random play; the same learned agent is pruned to each share{plays}. By size: this share, and no more. By "
-        "evidence, the default of `agent.prune`: then also what the transitions do not call for."
+        f"steps of random play; the same learned agent is pruned to each share{plays}. By size: exactly this share. By "
+        "evidence, the default of `agent.prune`: also the connections that the transitions do not support."
     )
 
 
@@ -153,7 +153,7 @@ def _sizes(sizes: Sequence[SizeRow]) -> Section:
         [str(row.d), str(row.seed), format_number(row.connections, 0), format_number(row.whole, 3), format_number(row.pruned, 3)]
         for row in sizes
     ]
-    note = "A world of d bits of which at most eight are ever open, 90% removed."
+    note = "Synthetic DBNs of d bits of which at most eight are ever random, 90% removed."
     if len({row.d for row in sizes}) > 1:
         whole, pruned = (format_number(exponent(sizes, name), 2) for name in ("whole", "pruned"))
         note += f" Cost grows as d to the power of {whole} before pruning and {pruned} after."
@@ -161,12 +161,12 @@ def _sizes(sizes: Sequence[SizeRow]) -> Section:
 
 
 def exponent(rows: Sequence[SizeRow], name: str) -> float:
-    """The power of d that a cost grows with: slope of the logarithms, by least squares."""
+    """Exponent of d in the growth of a cost: slope of the logarithms, by least squares."""
     return float(np.polyfit(np.log([row.d for row in rows]), np.log([getattr(row, name) for row in rows]), 1)[0])
 
 
 def section_of(outcomes: Sequence[Outcome]) -> tuple[Section, dict[str, bytes]]:
-    """What the page says about one game, and its pictures by name: the sums over paths and the modules are the first seed's."""
+    """The page's section on one game, and its pictures by name; sums over paths and modules are those of the first seed."""
     rows, first = summary(outcomes), outcomes[0]
     whole, (shown, best) = rows[0][0], rows[-1]
     middle = next((key for key, _ in rows if key[0] >= 0.9), shown)
@@ -175,7 +175,7 @@ def section_of(outcomes: Sequence[Outcome]) -> tuple[Section, dict[str, bytes]]:
     if others := {name: float(np.mean([o.others[name] for o in outcomes])) for name in first.others}:
         costs = [f"{name} {cost:.1f} µs, {cost / best['used']:.0f} times that of the last row" for name, cost in others.items()]
         notes.append(f"In the same run: {'; '.join(costs)}.")
-    cards = [Card(figure=pictures["curves"], about="What is left against the pruned fraction", table=_table(rows), notes=notes)]
+    cards = [Card(figure=pictures["curves"], about="Measures against the pruned fraction", table=_table(rows), notes=notes)]
     for number, key in enumerate(dict.fromkeys((whole, middle, shown))):
         pictures[f"paths_{number}"] = draw_paths(first, key, linked(first, shown))
         caption = captioned(key)
@@ -183,9 +183,9 @@ def section_of(outcomes: Sequence[Outcome]) -> tuple[Section, dict[str, bytes]]:
     if (game := find_case(first.cell.game).game) is not None:
         pictures["modules"] = draw_modules(first.linked[shown], game.observation_space.shape)
         cards.append(Card(f"Modules, {captioned(shown)}", pictures["modules"]))
-    about = "Variables that lead to each other in a step, and what leads to them."
+    about = "Variables that influence each other in one step, and their inputs."
     cards.append(Card(f"Modules, {100 * shown[0]:.0f}% removed", notes=[about], lines=first.modules[shown] or ["None."]))
-    about = "Variables that are drawn together, given state and action: numbered frames in the picture."
+    about = "Variables that are dependent given state and action: numbered frames in the picture."
     cards.append(Card("Drawn together", notes=[about], lines=first.groups[shown] or ["None."]))
     return Section(find_case(first.cell.game).title, cards), pictures
 
@@ -204,12 +204,12 @@ def _table(rows: Sequence[tuple[Key, Cells]]) -> Table:
 
 
 def captioned(key: Key) -> str:
-    """What is said of a share and a way."""
+    """Caption for a share and a method."""
     return f"{key[0]:.0%} of the connections removed, {key[1]}" if key[0] else "before pruning"
 
 
 def draw_curves(rows: Sequence[tuple[Key, Cells]]) -> bytes:
-    """Everything against the pruned fraction, a line for each way."""
+    """Plots all measures against the pruned fraction, with a line for each method."""
     fractions = sorted({key[0] for key, _ in rows})
     ticks: dict[float, str] = {i: f"{fraction:.0%}" for i, fraction in enumerate(fractions)}
     panels = []
@@ -224,10 +224,10 @@ def draw_curves(rows: Sequence[tuple[Key, Cells]]) -> bytes:
 
 
 def draw_paths(outcome: Outcome, key: Key, variables: Sequence[int]) -> bytes:
-    """The paper's figures 11 and 12: sums of absolute weights over paths, from inputs (x) to outputs (y); darker is more."""
+    """The paper's figures 11 and 12: sums of absolute weights over paths, from inputs (x) to outputs (y); darker is larger."""
     found, some = outcome.influences[key], np.asarray(variables, dtype=np.int64)
     names = [short(outcome.names[i]) for i in some]
-    rows = np.append(some, len(found.states) - 1)  # the end, too
+    rows = np.append(some, len(found.states) - 1)  # with termination
     states, actions, others = found.states[np.ix_(rows, some)], found.actions[rows], found.others[np.ix_(rows, rows)]
     parts = (
         ("predictor: state and action → next state", np.concatenate([states, actions], axis=1), [*names, *outcome.actions]),
@@ -243,7 +243,7 @@ def draw_paths(outcome: Outcome, key: Key, variables: Sequence[int]) -> bytes:
 
 
 def linked(outcome: Outcome, key: Key) -> list[int]:
-    """The state variables that lead to one or that something leads to; all if there are none."""
+    """The state variables that have links; all if there are none."""
     found = outcome.influences[key]
     n = len(outcome.names)
     out = (found.states > 0.0).any(axis=0) | (found.conditions > 0.0).any(axis=0) | (found.others[:, :n] > 0.0).any(axis=0)
@@ -253,7 +253,7 @@ def linked(outcome: Outcome, key: Key) -> list[int]:
 
 
 def _draw_map(axes: Axes, values: np.ndarray, inputs: Sequence[str], outputs: Sequence[str]) -> None:
-    """Darkness grows with the square root, so that weak connections are seen, too."""
+    """Draws a map; darkness grows with the square root, so that weak connections are visible."""
     axes.imshow(np.sqrt(values / max(values.max(), 1e-12)), cmap="Greys", vmin=0.0, vmax=1.0, interpolation="nearest")
     size = float(np.clip(520 / len(outputs), 2.6, 8.0))
     axes.set_xticks(range(len(inputs)), inputs, rotation=90, fontsize=size)
@@ -262,5 +262,5 @@ def _draw_map(axes: Axes, values: np.ndarray, inputs: Sequence[str], outputs: Se
 
 
 def short(name: str) -> str:
-    """A variable's name without what all have in common."""
+    """A variable's name without the part that all names share."""
     return name.removeprefix("observation")

@@ -1,4 +1,4 @@
-"""Modules as a picture: which variables belong together."""
+"""Picture of the modules of variables."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from mbagent.evaluation.figures import FIGURE_STYLE, to_png
 from mbagent.models.neural.influence import Influence, VariableGroup, dependent_groups, modules
 
 ALONE = "#eceff2"
-"""Of a variable that no other leads to, nor it to any."""
+"""Colour of a variable that has no links with others."""
 
 
 def draw_modules(found: Influence, shape: tuple[int, ...]) -> bytes:
-    """Each variable in the colour of its module; a frame around those that are drawn together, numbered by group.
+    """Draws each variable in the colour of its module, with a frame, numbered by group, around dependent variables.
 
     Args:
         found: sums over paths.
-        shape: of an observation; a picture for each of its planes [H, W], or one of a single row.
+        shape: shape of an observation; there is a picture for each of its planes [H, W], or one of a single row.
     """
     planes = (1,) * (3 - len(shape)) + shape if len(shape) < 3 else (int(np.prod(shape[:-2])), *shape[-2:])
     colours = _colours(modules(found), int(np.prod(shape)))

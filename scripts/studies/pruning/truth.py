@@ -1,4 +1,4 @@
-"""Which variables of a game really hang on which: what the connections that are left are compared with."""
+"""True dependencies between the variables of a game, for comparison with the remaining connections."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Agreement(NamedTuple):
 
 
 def agreement(game: Game, found: Influence) -> Agreement:
-    """Of the connections that are left with the true dependencies."""
+    """Agreement of the remaining connections with the true dependencies."""
     parents, nan = float((found.states[:-1] > 0.0).sum(axis=1).mean()), float("nan")
     if not isinstance(game, FlierCatcher):
         return Agreement(parents, nan, nan, nan, nan, nan)
@@ -40,7 +40,7 @@ def agreement(game: Game, found: Influence) -> Agreement:
 
 
 def flier_catcher_modules(game: FlierCatcher) -> list[frozenset[int]]:
-    """Variables that belong together: the player's rows, the cells of each row of fliers; at last the cells of new fliers."""
+    """True modules: the player's rows, the cells of each row of fliers, and last the cells of new fliers."""
     shape = game.observation_space.shape
     number: NDArray[Any] = np.arange(int(np.prod(shape))).reshape(shape)
     rows = [number[0, :, 0], *number[1], number[1, :, -1]]
@@ -55,16 +55,16 @@ def _rates(found: Bools, true: Bools) -> tuple[float, float]:
 def flier_catcher_dependencies(game: FlierCatcher) -> tuple[Bools, Bools]:
     """(from state to next state, bool [F, F]; between next variables, the later first, bool [F, F]).
 
-    A player's row hangs on the rows beside it and on itself; a cell with a flier on the one to its right; new fliers on nothing
-    but each other: at most one comes in a step.
+    A player's row depends on the adjacent rows and on itself; a flier's cell on the cell to its right; new fliers only on each
+    other, since at most one appears per step.
     """
     shape = game.observation_space.shape
     number: NDArray[Any] = np.arange(int(np.prod(shape))).reshape(shape)
     states = np.zeros((number.size, number.size), dtype=np.bool_)
     others = np.zeros_like(states)
     for row in range(game.height):
-        for beside in range(max(row - 1, 0), min(row + 2, game.height)):
-            states[number[0, row, 0], number[0, beside, 0]] = game.stay or beside != row or row in (0, game.height - 1)
+        for neighbour in range(max(row - 1, 0), min(row + 2, game.height)):
+            states[number[0, row, 0], number[0, neighbour, 0]] = game.stay or neighbour != row or row in (0, game.height - 1)
         states[number[1, row, :-1], number[1, row, 1:]] = True
         others[number[1, row, -1], number[1, :row, -1]] = True
     return states, others

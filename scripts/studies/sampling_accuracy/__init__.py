@@ -1,1 +1,1 @@
-"""How accurately models sample transition probabilities: the paper's section 3.3 and 3.4, measured again."""
+"""Accuracy of sampled transition probabilities: a replication of the paper's sections 3.3 and 3.4."""

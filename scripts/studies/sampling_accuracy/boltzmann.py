@@ -1,8 +1,8 @@
 """A conditional restricted Boltzmann machine, the other family of joint samplers that the paper's discussion mentions.
 
 P(y | x) is proportional to exp(y b + y A x) prod_h (1 + exp(c_h + W_h y + U_h x)), as in Mnih, Larochelle and Hinton 2011,
-"Conditional restricted Boltzmann machines for structured output prediction". x are the columns of state and action,
-y those of the next factors and ``terminated``; a factor with k > 2 values is a softmax unit of k columns. This model serves
+"Conditional restricted Boltzmann machines for structured output prediction". x are the inputs for state and action,
+y the outputs for the next factors and ``terminated``; a factor with k > 2 values is a softmax over k outputs. This model serves
 for comparison: the agent's own models sample in one pass and have exact probabilities.
 """
 

@@ -1,4 +1,4 @@
-"""The paper's generator of observations (section 3.3), with a named option for every sentence that can be read in two ways."""
+"""The paper's generator of observations (section 3.3), with a named option for each ambiguous sentence."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ class DataOptions:
 
     Attributes:
         d: number of variables of an input, and of an output.
-        c: outputs drawn for each input; equal ones may come up.
+        c: outputs drawn for each input; duplicates are possible.
         correlated: whether the variables of an output depend on each other.
-        relates: what a variable copies when r says so. "previous": the output variable set before it, which is what
-            makes outputs correlated among themselves. "input": the same variable of the input, the sentence as it stands;
-            given the input, the variables of an output are then independent. The first is nearer to the paper: a predictor
-            alone falls from .84 in trial 1a to .77 in 1b with it (the paper: .80 to .51), and rises to .89 with the other.
-        shuffle: "output": the order in which variables are set is drawn anew for every output, as step 4b reads.
-            "input": once for every input.
+        relates: source of a copied variable (random number r). "previous": the output variable set before it, which makes
+            the outputs correlated. "input": the same variable of the input, the literal reading, with which the variables
+            of an output are independent given the input. The first is closer to the paper: with it, the predictor alone
+            falls from .84 in trial 1a to .77 in 1b (the paper: .80 to .51); with the other it rises to .89.
+        shuffle: "output": the order in which variables are set is drawn for every output, the literal reading of step 4b.
+            "input": it is drawn once for every input.
         multiplier: the paper's b, "an optional multiplier for reducing large data sets": the share of the d^2 inputs
-            that is used. 1 everywhere, since the paper names no other value.
+            that are used. 1 in all trials, since the paper gives no other value.
 
     Raises:
         ValueError: a parameter is out of range.
@@ -55,7 +55,7 @@ class DataOptions:
 
     @property
     def n_inputs(self) -> int:
-        """Inputs in a data set: b d^2, but not more than there are."""
+        """Number of inputs in a data set: b d^2, but at most all possible ones."""
         wanted = max(1, round(self.multiplier * self.d**2))
         return wanted if self.d > 12 else min(wanted, 2**self.d)
 
@@ -78,7 +78,7 @@ class Observations:
         return int(self.inputs.shape[1])
 
     def dataset(self) -> TransitionDataset:
-        """The same as transitions with a single action; every observation counts as an episode."""
+        """The data as transitions with a single action; every observation counts as an episode."""
         n, c, d = self.outputs.shape
         data = TransitionDataset((2,) * d, 1)
         nothing = np.zeros(n * c, dtype=np.int64)
@@ -96,7 +96,7 @@ class Observations:
 
 
 def generate(options: DataOptions, seed: int) -> Observations:
-    """Draws a data set as section 3.3 describes."""
+    """Draws a data set as described in section 3.3."""
     rng = np.random.default_rng([seed, options.d, options.c, int(options.correlated)])
     inputs = _inputs(options, rng)
     n, d, c = options.n_inputs, options.d, options.c
@@ -107,7 +107,7 @@ def generate(options: DataOptions, seed: int) -> Observations:
     per_input = options.shuffle == "input"
     order = rng.permuted(np.tile(np.arange(d), (n, 1 if per_input else c, 1)), axis=2)
     order = np.broadcast_to(order, (n, c, d))
-    outputs = rng.integers(2, size=(n, c, d))  # what a variable is when nothing is copied
+    outputs = rng.integers(2, size=(n, c, d))  # values of variables that are not copied
     row, draw = np.arange(n)[:, None], np.arange(c)[None, :]
     for k in range(1, d):
         here, before = order[:, :, k], order[:, :, k - 1]

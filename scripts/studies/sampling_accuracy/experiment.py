@@ -1,4 +1,4 @@
-"""What is measured on which data: every sampler in every trial, one change at a time, and growing numbers of variables."""
+"""The plan of the measurements: every sampler in every trial, single changes, and growing numbers of variables."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from studies.sampling_accuracy.trials import SCALING, TRIALS, Trial, find_trial
 from studies.sampling_accuracy.variants import VARIANTS, fit_masked
 
 FIRST_SCORED_SEED = 1000
-"""Seeds from here on are scored; settings were chosen on those below."""
+"""First scored seed; settings were chosen on smaller seeds."""
 
 FEW_ITERATIONS = 25
-"""For the paper's remark on more training: the same networks after a tenth of the iterations."""
+"""A tenth of the iterations, to test the paper's remark on more training."""
 
 SLOW_SEEDS = 5
-"""The Boltzmann machine, a yardstick that takes longer than all else together, is fitted to so many data sets of a trial."""
+"""Number of data sets per trial for the Boltzmann machine, a baseline that takes longer than all other samplers together."""
 
 MOST_DRAWS = 1_000_000
 
 Part = Literal["samplers", "variants", "scaling"]
-"""Every sampler in every trial; the combined sampler with one thing changed at a time; growing numbers of variables."""
+"""Every sampler in every trial; variants of the combined sampler, with one change each; growing numbers of variables."""
 
 TABLES: dict[Part, str] = {"samplers": "results", "variants": "variants", "scaling": "scaling"}
-"""What the table of each part is called."""
+"""Names of the tables of the parts."""
 
 VARIED = {"2a": 5, "2c": 5, "3": 1}
-"""Trials in which one thing at a time is changed, and on how many data sets: those where the paper reports more than
-its networks reach here."""
+"""Trials for the variants, with the number of data sets: those in which the paper reports better results than its networks
+reach here."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What to run.
+    """Settings of the experiment.
 
     Attributes:
-        trials: names.
+        trials: names of the trials.
         seeds: data sets for each trial; None for the trial's own number.
-        first_seed: number of the first of them.
-        n_draws: draws for each input where they are many.
-        fit: how the paper's networks are fitted.
+        first_seed: number of the first data set.
+        n_draws: samples per input where many are drawn.
+        fit: options for fitting the paper's networks.
         relates, shuffle, multiplier: see DataOptions.
         parts: see Part.
 
@@ -79,7 +79,7 @@ class Settings:
             )
 
     def measured(self) -> dict[str, Any]:
-        """What decides a figure, as plain values: two runs may be put together where it is equal."""
+        """All settings that affect results, as plain values: runs with equal ones may be combined."""
         kept = asdict(self)
         return {name: kept[name] for name in ("n_draws", "relates", "shuffle", "multiplier", "fit")}
 
@@ -97,18 +97,18 @@ class Cell:
     def options(self) -> DataOptions:
         """The data's parameters."""
         given, options = self.settings, find_trial(self.trial).options
-        # Growing numbers of variables have a multiplier of their own, so that the largest can be fitted at all.
+        # Growing numbers of variables use their own multiplier, without which the largest could not be fitted.
         b = options.multiplier if self.part == "scaling" else given.multiplier
         return replace(options, relates=given.relates, shuffle=given.shuffle, multiplier=b)
 
     @property
     def place(self) -> tuple[int, int]:
-        """What the rows of a table are sorted by: trial and seed."""
+        """Sort key of the rows of a table: trial and seed."""
         return [trial.name for trial in (*TRIALS, *SCALING)].index(self.trial), self.seed
 
 
 def cells(settings: Settings) -> list[Cell]:
-    """All cells, the longest first."""
+    """All cells, longest first."""
     found: list[Cell] = []
     chosen = [find_trial(name) for name in dict.fromkeys(settings.trials)]
     for part in dict.fromkeys(settings.parts):

@@ -1,8 +1,8 @@
-"""How far a sampler's distribution is from the observed one: the paper's correlation, and measures that are not broken.
+"""Distance of a sampler's distribution from the observed one: the paper's correlation, and measures without its flaws.
 
-Everything is measured over inputs X and outcomes Y. The paper's own measure, Pearson's correlation over the outcomes
-that were observed or generated, rewards a sampler for spreading a little mass over many wrong outcomes (they add
-points near the origin) and is undefined when all probabilities are equal; total variation is neither.
+All measures are over inputs X and outcomes Y. The paper's own measure, Pearson's correlation over the outcomes
+that were observed or generated, favours samplers that spread a little mass over many wrong outcomes (which add
+points near the origin), and is undefined if all probabilities are equal; total variation has neither flaw.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ class Distribution:
     """Probabilities of outcomes, for several inputs.
 
     Attributes:
-        inputs: int64 [M], which input an entry belongs to, 0 ... n - 1.
-        outcomes: uint64 [M], number of the outcome (bit k is variable k); no pair (input, outcome) comes twice.
+        inputs: number of each entry's input, 0 ... n - 1, int64 [M].
+        outcomes: number of each entry's outcome (bit k is variable k), uint64 [M]; pairs (input, outcome) are distinct.
         probabilities: float64 [M], above zero.
         n: number of inputs.
-        complete: whether what is not listed has probability zero; False: it was not looked at.
+        complete: whether outcomes that are not listed have probability zero; if False, theirs are unknown.
     """
 
     inputs: NDArray[np.int64]
@@ -42,7 +42,7 @@ def number(bits: NDArray[np.int64]) -> NDArray[np.uint64]:
 
 
 def counted(inputs: NDArray[np.int64], outcomes: NDArray[np.uint64], weights: Floats, n: int) -> Distribution:
-    """The distribution of draws: weights [M] of equal (input, outcome) add up, and each input's sum to one."""
+    """The distribution of samples: weights [M] of equal (input, outcome) are added and normalised for each input."""
     order = np.lexsort((outcomes, inputs))
     inputs, outcomes, weights = inputs[order], outcomes[order], weights[order]
     new = np.r_[True, (inputs[1:] != inputs[:-1]) | (outcomes[1:] != outcomes[:-1])]
@@ -52,7 +52,7 @@ def counted(inputs: NDArray[np.int64], outcomes: NDArray[np.uint64], weights: Fl
 
 
 def align(observed: Distribution, other: Distribution) -> tuple[Floats, Floats]:
-    """Probabilities (p, q) of every (input, outcome) that either lists; 0 where one does not."""
+    """Probabilities (p, q) of every (input, outcome) in either distribution; 0 if one does not list it."""
     inputs = np.concatenate([observed.inputs, other.inputs])
     outcomes = np.concatenate([observed.outcomes, other.outcomes])
     first = np.arange(len(inputs)) < len(observed.inputs)
@@ -66,7 +66,7 @@ def align(observed: Distribution, other: Distribution) -> tuple[Floats, Floats]:
 
 
 def correlation(p: Floats, q: Floats) -> float:
-    """Pearson's correlation; NaN where one side does not vary."""
+    """Pearson's correlation; NaN if one side is constant."""
     if len(p) < 2 or np.ptp(p) < 1e-12 or np.ptp(q) < 1e-12:
         return float("nan")
     return float(np.corrcoef(p, q)[0, 1])
@@ -87,7 +87,7 @@ def full_correlation(observed: Distribution, generated: Distribution, d: int) ->
     """Pearson over all n 2^d pairs of input and outcome."""
     p, q = align(observed, generated)
     rest = observed.n * 2**d - len(p)
-    # The pairs that neither lists are (0, 0): sums are known without writing them out.
+    # Pairs in neither list are (0, 0) and do not need to be enumerated for the sums.
     n = len(p) + rest
     mean_p, mean_q = p.sum() / n, q.sum() / n
     spread_p, spread_q = (p**2).sum() / n - mean_p**2, (q**2).sum() / n - mean_q**2
@@ -97,7 +97,7 @@ def full_correlation(observed: Distribution, generated: Distribution, d: int) ->
 
 
 def total_variation(observed: Distribution, generated: Distribution) -> float:
-    """Half the summed absolute difference, mean over inputs; what ``generated`` does not list is mass on other outcomes."""
+    """Half the summed absolute difference, mean over inputs; mass missing in ``generated`` is on other outcomes."""
     p, q = align(observed, generated)
     unlisted = 0.0 if generated.complete else generated.n - float(q.sum())
     return float((np.abs(p - q).sum() + unlisted) / (2 * observed.n))

@@ -1,4 +1,4 @@
-"""The page and the table that the experiment ends in."""
+"""The page and the table of the experiment."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class _Headline:
 
 
 def write_page(path: Path, scores: Mapping[Part, Sequence[Score]], points: Points, settings: Settings, command: str) -> None:
-    """Writes the HTML page, pictures and all, into one file; parts without scores are left out."""
+    """Writes the HTML page with its pictures into one file; parts without scores are skipped."""
     measured = scores["samplers"]
     tables = [(trial, table(measured, trial)) for trial in TRIALS if any(s.trial == trial.name for s in measured)]
     page = render(
@@ -72,7 +72,7 @@ def _headline(trial: Trial, lines: Sequence[Line]) -> _Headline:
 
 
 def draw_scatter(points: Points) -> bytes:
-    """Observed against inferred probabilities, one panel a trial."""
+    """Observed against inferred probabilities, one panel per trial."""
     names = [trial.name for trial in TRIALS if (trial.name, PREDICTOR) in points]
     columns = min(3, len(names))
     rows = -(-len(names) // columns)
@@ -100,7 +100,7 @@ _CURVES: dict[str, tuple[Draws, str, str]] = {
 
 
 def draw_scaling(scores: Sequence[Score]) -> bytes:
-    """Error, cost of a draw and number of weights against the number of variables d."""
+    """Error, cost per sample and number of weights against the number of variables d."""
     trials = [trial for trial in SCALING if any(score.trial == trial.name for score in scores)]
     sizes = [trial.options.d for trial in trials]
     with mpl.rc_context(FIGURE_STYLE):

@@ -1,4 +1,4 @@
-"""What an experiment leaves on disk, so that the page can be written again without measuring again."""
+"""Results of the experiment on disk, from which the page can be rewritten without new measurements."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MOST_POINTS = 4000
 
 
 def first_points(results: Sequence[Result[Cell]]) -> Points:
-    """The points of each trial's first data set, thinned out where they are too many to draw."""
+    """The points of each trial's first data set, thinned out if there are too many to plot."""
     points: Points = {}
     for result in sorted(results, key=lambda result: result.cell.seed, reverse=True):
         for sampler, pairs in result.arrays.items():
@@ -42,7 +42,7 @@ def save_points(path: Path, points: Points) -> None:
 
 
 def load_points(path: Path) -> Points:
-    """Reads what ``save_points`` wrote; nothing where there is no such file.
+    """Reads a file of ``save_points``; empty if there is no such file.
 
     Raises:
         ValueError: the file is damaged.
@@ -53,12 +53,12 @@ def load_points(path: Path) -> Points:
         with np.load(path, allow_pickle=False) as archive:
             pairs = {name: archive[name] for name in archive}
     except (OSError, EOFError, ValueError, BadZipFile) as error:
-        raise ValueError(f"{path} cannot be read ({error}); delete it, or measure anew without --resume.") from error
+        raise ValueError(f"{path} cannot be read ({error}); delete it, or measure again without --resume.") from error
     return {(name.partition("|")[0], name.partition("|")[2]): value for name, value in pairs.items()}
 
 
 def load_scores(path: Path) -> list[Score]:
-    """Reads a table of scores; nothing where there is no such file.
+    """Reads a table of scores; empty if there is no such file.
 
     Raises:
         ValueError: the file is damaged; the message names the line.
@@ -77,7 +77,7 @@ def load_scores(path: Path) -> list[Score]:
                 find_trial(scores[-1].trial)
     except ValueError as error:
         line = len(scores) + 2
-        raise ValueError(f"{path} cannot be read (line {line}: {error}); mend or delete it, or measure anew.") from error
+        raise ValueError(f"{path} cannot be read (line {line}: {error}); repair or delete it, or measure again.") from error
     return scores
 
 
@@ -87,7 +87,7 @@ def save_settings(path: Path, settings: Settings) -> None:
 
 
 def load_settings(path: Path) -> Settings:
-    """Reads what ``save_settings`` wrote.
+    """Reads a file of ``save_settings``.
 
     Raises:
         ValueError: there is no such file, or it is damaged.
@@ -99,4 +99,4 @@ def load_settings(path: Path) -> Settings:
         given: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in kept.items()}
         return Settings(**{**given, "fit": FitOptions(**kept["fit"])})
     except (ValueError, TypeError, KeyError) as error:
-        raise ValueError(f"{path} cannot be read ({error}); measure anew without --resume.") from error
+        raise ValueError(f"{path} cannot be read ({error}); measure again without --resume.") from error

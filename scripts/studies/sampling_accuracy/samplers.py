@@ -1,4 +1,4 @@
-"""The samplers compared, each a transition model fitted to a trial's observations."""
+"""The compared samplers, each a transition model fitted to the observations of a trial."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ TABLE = "counts with a prior"
 PERFECT = "perfect sampler"
 
 EXHAUSTIVE = 12
-"""Up to so many variables all 2^d outcomes are listed."""
+"""Largest number of variables for which all 2^d outcomes are listed."""
 
 
 @dataclass(frozen=True)
 class FitOptions:
-    """How the paper's networks are fitted, where its text leaves a choice.
+    """Options for fitting the paper's networks, where its text leaves a choice.
 
     Attributes:
         iterations: passes over the data, "reshuffling the data on each iteration".
-        targets: "batch": P(y | X), the frequencies, as in 3.1's first method; "online": every observation's own y,
-            one update each, its second, "slower and sensitive to the order of training".
+        targets: "batch": the frequencies P(y | X), the first method of section 3.1; "online": one update for the y of
+            each observation, its second method, "slower and sensitive to the order of training".
         loss: "squared", as in backpropagation's textbook form, or "cross_entropy".
-        learning_rate: largest rate of the batch method's schedule; the on-line method takes a third of it throughout.
+        learning_rate: maximum of the batch method's schedule; the online method uses a constant third of it.
         memory: AdamW's second beta (batch targets).
-        updates: updates an iteration makes, each on as many observations (batch targets).
-        sweeps: passes over all variables for one sample; the paper says "repeat".
-        real_guess: start from the predictor's probabilities, as step 2 reads, rather than from bits drawn from them.
-        rounding: "2d^2+1" hidden nodes in d groups: "down" is 2d a group, "up" 2d + 1.
-        widening: as many times the paper's hidden nodes.
+        updates: updates per iteration, each with the same number of observations (batch targets).
+        sweeps: passes over all variables for one sample; the paper says only "repeat".
+        real_guess: start from the predictor's probabilities, the literal reading of step 2, instead of bits sampled from them.
+        rounding: of "2d^2+1" hidden nodes in d groups: "down" gives 2d per group, "up" 2d + 1.
+        widening: factor of the paper's number of hidden nodes.
 
     Raises:
         ValueError: an option is out of range.
@@ -74,7 +74,7 @@ class FitOptions:
 
 
 def paper_config(d: int, n: int, options: FitOptions) -> NeuralConfig:
-    """The paper's two networks for d variables, and how they are fitted to n observations."""
+    """Configuration of the paper's two networks for d variables, and of their fit to n observations."""
     config = NeuralConfig.paper(d)
     training = replace(
         config.training,
@@ -96,9 +96,9 @@ def paper_config(d: int, n: int, options: FitOptions) -> NeuralConfig:
 
 
 def causal_config(d: int) -> NeuralConfig:
-    """The agent's conditioner, grown and trained until it knows the observations by heart: here nothing generalises.
+    """The agent's conditioner, large and trained until it memorises the observations, as this data does not generalise.
 
-    Whole-batch steps where the data are few: the noise of small batches keeps probabilities from reaching 0 and 1.
+    Small data is fitted with full-batch steps, since the noise of small batches keeps probabilities from reaching 0 and 1.
     """
     training = TrainingConfig(
         learning_rate=0.06,
@@ -134,7 +134,7 @@ def _fit_online(model: NeuralTransitionModel, data: Observations, iterations: in
     rows, rng = data.dataset().rows(), np.random.default_rng(seed)
     for _ in range(iterations):
         for i in rng.permutation(len(rows)):
-            row = rows.select(slice(i, i + 1))  # any index will do
+            row = rows.select(slice(i, i + 1))  # the index has no meaning
             model.observe(row.states, row.actions, row.next_states, row.terminated)
 
 
@@ -146,7 +146,7 @@ def fit_causal(data: Observations, seed: int) -> NeuralTransitionModel:
 
 
 def fit_boltzmann(data: Observations, seed: int) -> ConditionalBoltzmannMachine:
-    """The other family that the paper's discussion names."""
+    """The alternative model mentioned in the paper's discussion."""
     config = BoltzmannConfig(hidden=16 * data.d, learning_rate=0.05, batch_size=32, epochs=0.0, min_steps=3000, burn_in=40)
     model = ConditionalBoltzmannMachine((2,) * data.d, 1, config)
     model.fit(data.dataset(), seed=seed)
@@ -154,7 +154,7 @@ def fit_boltzmann(data: Observations, seed: int) -> ConditionalBoltzmannMachine:
 
 
 def fit_table(data: Observations, prior: float) -> TabularModel:
-    """Counts; without a prior they are the perfect sampler."""
+    """Counts; without a prior they are a perfect sampler."""
     model = TabularModel((2,) * data.d, 1, prior=prior, validation=0.0)
     model.fit(data.dataset())
     return model
@@ -167,7 +167,7 @@ def observed(data: Observations) -> Distribution:
 
 
 def draw(model: TransitionModel, data: Observations, n_draws: int, seed: int) -> Distribution:
-    """Frequencies of ``n_draws`` independent draws for each input."""
+    """Frequencies of ``n_draws`` independent samples per input."""
     n = len(data.inputs)
     found = np.empty((n, n_draws), dtype=np.uint64)
     step = max(1, 200_000 // n_draws)
@@ -180,9 +180,9 @@ def draw(model: TransitionModel, data: Observations, n_draws: int, seed: int) ->
 
 
 def draw_systematically(model: TransitionModel, data: Observations, n_draws: int, seed: int) -> Distribution:
-    """Outcomes hit by ``n_draws`` systematic draws for each input, weighted as planners get them.
+    """Outcomes of ``n_draws`` systematic samples per input, with the weights that planners get.
 
-    That is by their exact probability where the outcomes hit hold nearly all of the mass, else by how often they were hit.
+    These are the exact probabilities if the outcomes contain nearly all of the mass, else their frequencies.
     """
     n = len(data.inputs)
     successors = model.successors(data.inputs, np.zeros(n, dtype=np.int64), n_draws, seed)
@@ -190,10 +190,10 @@ def draw_systematically(model: TransitionModel, data: Observations, n_draws: int
 
 
 def exact(model: TransitionModel, data: Observations) -> Distribution:
-    """Exact probabilities: of all outcomes where those can be listed, else of the observed ones.
+    """Exact probabilities of all outcomes if they can be listed, else of the observed ones.
 
     Raises:
-        NotImplementedError: the model has none.
+        NotImplementedError: the model has no exact probabilities.
     """
     n, d = len(data.inputs), data.d
     if d <= EXHAUSTIVE:

@@ -24,12 +24,12 @@ from studies.sampling_accuracy.measures import (
 )
 
 Draws = Literal["exact", "many", "c", "c systematic"]
-"""How a distribution was found: exact probabilities, many independent draws, c independent or c systematic ones."""
+"""Source of a distribution: exact probabilities, many independent samples, or c independent or c systematic ones."""
 
 NAN = float("nan")
 
 FEW_DRAWS = 100
-"""Draws for each input of slow samplers, of variants and of growing numbers of variables beyond ``samplers.EXHAUSTIVE``."""
+"""Samples per input for slow samplers, variants, and growing numbers of variables beyond ``samplers.EXHAUSTIVE``."""
 
 
 @dataclass(frozen=True)
@@ -37,19 +37,19 @@ class Score:
     """One sampler on one data set.
 
     Attributes:
-        trial, seed: which data.
-        sampler: its name.
-        draws: how its distribution was found.
-        union: Pearson over the outcomes observed or generated, the paper's; NaN where undefined.
+        trial, seed: identification of the data set.
+        sampler: name of the sampler.
+        draws: source of its distribution.
+        union: Pearson over the outcomes observed or generated, the paper's measure; NaN if undefined.
         seen: Pearson over the outcomes observed.
-        full: Pearson over all outcomes; NaN where they are too many to list.
+        full: Pearson over all outcomes; NaN if there are too many to list.
         variation: total variation, mean over inputs.
         valid: generated mass on observed outcomes, mean over inputs.
-        log_likelihood: nats an observation, from exact probabilities; else NaN.
-        at_zero: mean probability given to outcomes that were never observed; NaN where they are too many to list.
-        at_one: mean probability given to outcomes that were always observed; NaN if there are none.
+        log_likelihood: nats per observation, from exact probabilities; else NaN.
+        at_zero: mean probability of outcomes that were never observed; NaN if there are too many to list.
+        at_one: mean probability of outcomes that were always observed; NaN if there are none.
         parameters: number of weights that are not pruned.
-        fit_seconds, sample_microseconds: processor time of the fit, and of one draw.
+        fit_seconds, sample_microseconds: processor time of the fit, and per sample.
     """
 
     trial: str
@@ -73,9 +73,9 @@ class Bench:
     """Collects the scores of one data set.
 
     Args:
-        trial, seed: what the scores are filed under.
+        trial, seed: identification for the scores.
         data: the data set.
-        n_draws: draws for each input where they are many.
+        n_draws: samples per input where many are drawn.
     """
 
     def __init__(self, trial: str, seed: int, data: Observations, n_draws: int) -> None:
@@ -91,9 +91,9 @@ class Bench:
         self.add(sampler, "exact", found, size(model), seconds, log_likelihood=s.log_likelihood(self.truth, found))
 
     def many(self, sampler: str, model: TransitionModel, seconds: float, *, keep: bool = False, slow: bool = False) -> None:
-        """Scores a model by c and by many independent draws; ``keep`` keeps the points of the latter for the scatter plot.
+        """Scores a model by c and by many independent samples; ``keep`` stores the points of the latter for the scatter plot.
 
-        ``slow`` samplers draw at most ``FEW_DRAWS`` times where variables are many.
+        ``slow`` samplers draw at most ``FEW_DRAWS`` samples if there are many variables.
         """
         n_draws = min(self.n_draws, FEW_DRAWS) if slow and self.data.d > s.EXHAUSTIVE else self.n_draws
         self._drawn(sampler, "c", model, seconds, self.data.outputs.shape[1])
@@ -102,7 +102,7 @@ class Bench:
             self.points[sampler] = np.stack(align(self.truth, found), axis=1)
 
     def every_way(self, sampler: str, model: TransitionModel, seconds: float) -> None:
-        """By exact probabilities, many draws, c draws and c systematic draws."""
+        """Scores a model by exact probabilities, many samples, c samples and c systematic samples."""
         self.exact(sampler, model, seconds)
         self.many(sampler, model, seconds)
         found = s.draw_systematically(model, self.data, self.data.outputs.shape[1], self.seed)
@@ -154,7 +154,7 @@ def _mean(values: NDArray[np.float64]) -> float:
 
 
 def timed(work: Callable[[], s.T]) -> tuple[s.T, float]:
-    """What the work returns, and the processor seconds it took."""
+    """Result of the work, and its processor time in seconds."""
     start = time.process_time()
     result = work()
     return result, time.process_time() - start

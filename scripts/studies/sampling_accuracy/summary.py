@@ -1,4 +1,4 @@
-"""From the scores of single data sets to the table, and to the paper's conclusions as checked statements (section 3.4)."""
+"""Summary of the scores of single data sets: the tables, and checks of the paper's conclusions (section 3.4)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MEASURES: dict[str, str] = {
     "valid": "Valid mass",
     "log_likelihood": "Log-likelihood",
 }
-"""Columns of the table: field of a score and what it is called."""
+"""Columns of the table: field of a score and title."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Cell:
     """A measure over seeds.
 
     Attributes:
-        interval: mean with its 95% t interval, over the seeds where it is defined; NaN where it never is.
-        undefined: seeds where it is not.
+        interval: mean with its 95% t interval, over the seeds for which it is defined; NaN if there are none.
+        undefined: number of seeds for which it is undefined.
     """
 
     interval: Interval
@@ -42,7 +42,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Line:
-    """One sampler's line in a trial's table."""
+    """One sampler's row in the table of a trial."""
 
     sampler: str
     draws: Draws
@@ -59,8 +59,8 @@ class Statement:
 
     Attributes:
         text: the conclusion.
-        evidence: the figures it is judged by.
-        holds: whether they bear it out; None where an interval leaves it open, or a figure is undefined.
+        evidence: the results on which the check is based.
+        holds: whether they support it; None if an interval leaves it open, or a result is undefined.
     """
 
     text: str
@@ -75,7 +75,7 @@ def cell(values: Iterable[float]) -> Cell:
 
 
 def table(scores: Sequence[Score], trial: Trial) -> list[Line]:
-    """A trial's lines, in the order in which samplers were measured."""
+    """The rows of a trial, in the order in which samplers were measured."""
     mine = [score for score in scores if score.trial == trial.name]
     lines = []
     for sampler, draws in dict.fromkeys((score.sampler, score.draws) for score in mine):
@@ -95,7 +95,7 @@ def table(scores: Sequence[Score], trial: Trial) -> list[Line]:
 
 
 def markdown_table(scores: Sequence[Score]) -> str:
-    """The main figures as Markdown, a line for each trial."""
+    """The main results as Markdown, with a row for each trial."""
 
     def mean(trial: Trial, sampler: str, draws: Draws, field: str, digits: int = 2) -> str:
         chosen = [s for s in scores if (s.trial, s.sampler, s.draws) == (trial.name, sampler, draws)]
@@ -120,7 +120,7 @@ def markdown_table(scores: Sequence[Score]) -> str:
 
 @dataclass(frozen=True)
 class VariantLine:
-    """One thing changed: correlation and total variation in each trial, by its name."""
+    """One variant: correlation and total variation in each trial, by the trial's name."""
 
     name: str
     union: dict[str, Cell]
@@ -128,7 +128,7 @@ class VariantLine:
 
 
 def variant_table(scores: Sequence[Score]) -> list[VariantLine]:
-    """The lines of the table in which one thing at a time is changed."""
+    """The rows of the table of variants."""
     trials = list(dict.fromkeys(score.trial for score in scores))
 
     def cells(name: str, field: str) -> dict[str, Cell]:
@@ -140,10 +140,10 @@ def variant_table(scores: Sequence[Score]) -> list[VariantLine]:
 
 
 def paper_parameters(d: int) -> tuple[int, int]:
-    """Weights of predictor and conditioner by the paper's counts: 2d + 1 hidden nodes, 2d^2 + 1 less the pruned weights.
+    """Weights of predictor and conditioner by the paper's counts: 2d + 1 hidden nodes, 2d^2 + 1 without the pruned weights.
 
-    The predictor: d (2d + 1) + (2d + 1) d and thresholds. The conditioner: 2d nodes in each of d groups, each with d
-    inputs and d - 1 other outputs, a threshold and one weight to its output, and the outputs' thresholds.
+    Predictor: d (2d + 1) + (2d + 1) d weights, and biases. Conditioner: 2d nodes in each of d groups, each with weights from d
+    inputs and d - 1 other outputs, a bias and one weight to its output, and the biases of the outputs.
     """
     predictor = d * (2 * d + 1) + (2 * d + 1) * d + (2 * d + 1) + d
     conditioner = 2 * d * d * (d + d - 1 + 1 + 1) + d
@@ -151,7 +151,7 @@ def paper_parameters(d: int) -> tuple[int, int]:
 
 
 def statements(scores: Sequence[Score]) -> list[Statement]:
-    """The conclusions of section 3.4 that the trials at hand can judge."""
+    """The conclusions of section 3.4 that can be checked with the given trials."""
     present = {score.trial for score in scores}
     found = [_better_than_alone(scores)]
     if {"1a", "1b"} <= present:
@@ -164,7 +164,7 @@ def statements(scores: Sequence[Score]) -> list[Statement]:
 
 
 def _values(scores: Sequence[Score], trial: str, sampler: str, read: Callable[[Score], float]) -> np.ndarray:
-    """One value a seed, of the samplers' many draws."""
+    """One value per seed, from the scores with many samples."""
     chosen = [s for s in scores if (s.trial, s.sampler, s.draws) == (trial, sampler, "many")]
     return np.array([read(s) for s in sorted(chosen, key=lambda s: s.seed)], dtype=np.float64)
 
@@ -238,14 +238,14 @@ def _signed(interval: Interval) -> str:
 
 
 def _above_zero(interval: Interval) -> bool | None:
-    """Whether a mean is above zero; None where its interval does not tell."""
+    """Whether a mean is above zero; None if its interval leaves it open."""
     if interval.high <= 0.0:
         return False
     return True if interval.low > 0.0 else None
 
 
 def _greater(first: np.ndarray, second: np.ndarray) -> bool | None:
-    """Whether one mean is above another, by Welch's test at 5%; None where it does not tell."""
+    """Whether one mean is above another, by Welch's test at 5%; None if the test leaves it open."""
     first, second = (values[~np.isnan(values)] for values in (first, second))
     if min(len(first), len(second)) < 2 or np.ptp(first) + np.ptp(second) == 0.0:
         return None
@@ -255,7 +255,7 @@ def _greater(first: np.ndarray, second: np.ndarray) -> bool | None:
 
 
 def _all(held: Sequence[bool | None]) -> bool | None:
-    """Whether all hold; None where none fails and some are open."""
+    """Whether all hold; None if none fails and some are open."""
     if any(one is False for one in held):
         return False
     return None if None in held else True

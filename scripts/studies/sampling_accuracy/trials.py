@@ -1,4 +1,4 @@
-"""The paper's six trials and what it measured in them (section 3.3)."""
+"""The paper's six trials and its results (section 3.3)."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class Trial:
     """One trial.
 
     Attributes:
-        name: as in the paper.
-        options: its data.
+        name: name in the paper.
+        options: options of its data.
         paper_predictor: the paper's correlation for the predictor alone.
         paper_combined: the same for predictor and conditioner combined.
-        seeds: seeds that a full run scores: more where data sets are tiny and differ much.
+        seeds: number of seeds in a full run; more if data sets are tiny and differ strongly.
     """
 
     name: str
@@ -30,7 +30,7 @@ class Trial:
 
     @property
     def about(self) -> str:
-        """Its data in a few words."""
+        """Short description of its data."""
         o = self.options
         return f"d = {o.d}, {'high' if o.correlated else 'low'} correlation, c = {o.c}, {o.n_inputs} inputs"
 
@@ -50,14 +50,14 @@ SCALING: tuple[Trial, ...] = (
     Trial("d = 32", DataOptions(32, 5), NAN, NAN, seeds=1),
     Trial("d = 64", DataOptions(64, 5, multiplier=0.25), NAN, NAN, seeds=1),
 )
-"""Growing numbers of variables; the last has as many inputs as the one before, so that it can be fitted in minutes."""
+"""Growing numbers of variables; the last has as many inputs as the previous one, so that the fit takes only minutes."""
 
 
 def find_trial(name: str) -> Trial:
     """The trial called ``name``, one of the paper's or of those with growing numbers of variables.
 
     Raises:
-        ValueError: there is none; the message lists those there are.
+        ValueError: there is none; the message lists the known names.
     """
     known = {trial.name: trial for trial in (*TRIALS, *SCALING)}
     if name not in known:

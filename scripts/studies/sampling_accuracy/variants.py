@@ -1,4 +1,4 @@
-"""Why the combined sampler stops where it does: the same networks with one thing changed at a time."""
+"""Causes of the combined sampler's remaining error: the same networks with one change at a time."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from studies.sampling_accuracy.measures import Distribution, counted, number
 from studies.sampling_accuracy.samplers import FitOptions, draw, fit_paper, paper_config
 
 Sampler: TypeAlias = Callable[[Observations, FitOptions, int, int], Distribution]
-"""(data, options, number of draws for each input, seed) -> what was drawn."""
+"""(data, options, number of samples per input, seed) -> distribution of the samples."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One thing changed.
+    """One change of the combined sampler.
 
     Attributes:
-        name: what is changed.
-        sample: fits and draws.
+        name: the change.
+        sample: fits and samples.
     """
 
     name: str
@@ -39,7 +39,7 @@ def _changed(change: Callable[[FitOptions], FitOptions]) -> Sampler:
 
 
 def fit_masked(data: Observations, options: FitOptions, seed: int) -> NeuralTransitionModel:
-    """The paper's networks but for the mask: output i is shown y_<i, so a draw takes one pass and nothing has to converge."""
+    """The paper's networks with a causal mask: output i depends on y_<i, so a sample takes one pass without convergence."""
     config = paper_config(data.d, data.outputs.shape[0] * data.outputs.shape[1], options)
     model = NeuralTransitionModel((2,) * data.d, 1, replace(config, conditioner="causal"), seed=seed)
     model.fit(data.dataset(), seed=seed)
@@ -53,8 +53,8 @@ def _causal(data: Observations, options: FitOptions, n_draws: int, seed: int) ->
 def draw_exact_sweeps(data: Observations, options: FitOptions, n_draws: int, seed: int) -> Distribution:
     """The paper's procedure with perfect networks: every probability is the observed frequency.
 
-    Where the other variables' values were never observed together there is no frequency; the predictor's probability
-    stands in, which is what the procedure started from.
+    If the other variables' values were never observed together, there is no frequency; then the predictor's probability
+    is used, from which the procedure started.
     """
     rng, found = np.random.default_rng(seed), []
     for outcomes in data.outputs:
@@ -64,7 +64,7 @@ def draw_exact_sweeps(data: Observations, options: FitOptions, n_draws: int, see
 
 
 def _swept(outcomes: Bits, n_draws: int, sweeps: int, rng: np.random.Generator) -> Bits:
-    """Draws [n_draws, d] for an input whose observed outcomes are [c, d]."""
+    """Samples [n_draws, d] for an input with observed outcomes [c, d]."""
     d, marginal = outcomes.shape[1], outcomes.mean(axis=0)
     bits: Bits = (rng.random((n_draws, d)) < marginal).astype(np.int64)
     wrong: NDArray[np.int64] = (bits[:, None] != outcomes[None]).sum(axis=2)  # [n_draws, c]

@@ -1,4 +1,4 @@
-"""How environments that are not the agent's own are played and scored."""
+"""Play and scores of agents on environments of other packages."""
 
 import importlib.util
 from pathlib import Path
@@ -98,7 +98,7 @@ def test_rddl_tables_are_the_domains_rules(name: str) -> None:
     known, model = exact_world(world), true_model(world)
     assert known is not None
     assert model is not None
-    np.testing.assert_allclose(tables.transitions().sum(axis=2), 1.0)  # nothing leads out of the tables
+    np.testing.assert_allclose(tables.transitions().sum(axis=2), 1.0)  # all transitions stay within the tables
     state, _ = env.reset(seed=0)
     off = []
     for _ in range(1500):

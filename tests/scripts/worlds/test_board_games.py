@@ -1,4 +1,4 @@
-"""The board games' rules, by hand."""
+"""The rules of the board games, checked by hand."""
 
 import numpy as np
 

@@ -33,6 +33,6 @@ def test_what_the_worlds_do() -> None:
     assert left.max() < 5.0
     assert ring(4).goal(np.ones((1, 4), int), np.array([2]), np.ones((1, 4), int))[0] == 3.25
     life = cells(3)
-    line = np.array([[0, 0, 0, 1, 1, 1, 0, 0, 0]])  # turns by a right angle
+    line = np.array([[0, 0, 0, 1, 1, 1, 0, 0, 0]])  # rotates by a right angle
     on = life.model.marginals(line, np.array([0])).reshape(9, 2)[:, 1]
     np.testing.assert_allclose(on, np.where([0, 1, 0, 0, 1, 0, 0, 1, 0], 0.9, 0.1))

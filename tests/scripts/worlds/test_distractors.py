@@ -1,4 +1,4 @@
-"""Made-up worlds with bits beside them."""
+"""Synthetic environments with distractor bits."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ def test_cores_are_as_large_as_they_should_be() -> None:
     assert len(chain(16).reachable()) == 16
     assert len(grid(20).reachable()) == 400
     assert 80 < len(grid(12, 0.3).reachable()) < 144
-    n, wall = 8, 4  # left of the wall without key; with it and a shut door on either side; with an open door everywhere
+    n, wall = 8, 4  # without key: left of the wall; with key and shut door: either side; with open door: everywhere
     assert len(key_and_door(n).reachable()) == n * wall + n * (n - 1) + 1 + n * (n - 1) + 1 - n * (n - wall - 1) - 1
 
 

@@ -1,4 +1,4 @@
-"""An environment as a model of itself, beside the table of its rules."""
+"""An environment as a model of itself, compared with the table of its rules."""
 
 import gymnasium as gym
 import numpy as np

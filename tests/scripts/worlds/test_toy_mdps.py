@@ -1,4 +1,4 @@
-"""Worlds made up for the benchmark."""
+"""Toy MDPs of the benchmark."""
 
 import gymnasium as gym
 import numpy as np

@@ -1,4 +1,4 @@
-"""The comparison's machinery, with a quick stand-in for the agent that owns two weights and plays badly."""
+"""The comparison, with a fast stand-in for the agent that has two weights and a poor policy."""
 
 import io
 import itertools
@@ -78,7 +78,7 @@ def test_a_whole_comparison_becomes_one_page_and_one_table(tmp_path: Path) -> No
     assert len(results[0].goals) >= 3
 
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "http" not in page  # nothing is fetched
+    assert "http" not in page  # no external resources
     assert page.count("data:image/png;base64,") == 4  # bars, curves, two environments
     table = (tmp_path / "results.csv").read_text(encoding="utf-8").splitlines()
     assert table[0].startswith("case,agent,goal,seed,environment_steps")

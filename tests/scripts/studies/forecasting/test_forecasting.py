@@ -46,7 +46,7 @@ def test_distributions_after_a_string_are_those_of_the_game() -> None:
     expected = np.clip(np.clip(position + 2, 0, 5) - 1, 0, 5)
     np.testing.assert_array_equal(position[after.argmax(axis=1)], expected)
     assert m.joint_variation(after, after) == pytest.approx(0.0)
-    assert m.joint_variation(0.75 * after, after) == pytest.approx(0.25)  # what is missing went to other states
+    assert m.joint_variation(0.75 * after, after) == pytest.approx(0.25)  # the missing mass is on other states
 
 
 def test_worlds_too_large_to_list_are_not_listed() -> None:
@@ -76,7 +76,7 @@ def test_a_whole_run_becomes_one_page_and_one_table(tmp_path: Path) -> None:
     found = tables(results["results"], [])
     assert [(table.name, table.measure) for table in found] == [(names[0], "joint"), (names[1], "marginal")]
     joint = {(row["method"], row["n"]): row["joint"] for row in results["results"] if row["case"] == names[0]}
-    assert joint["direct", 1] == joint["iterated", 1]  # one step is one step
+    assert joint["direct", 1] == joint["iterated", 1]  # both are the same model for one step
     assert joint["true again", 3] == 0.0
     assert [cell.case for cell in cells(Settings(seeds=1))] == list(reversed(CASES))
 
@@ -96,7 +96,7 @@ def test_a_measure_is_used_only_where_it_exists_for_every_score() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "message"),
     [
         (["--steps", "0"], "n = 1, 2"),
         (["--games", "Chess"], "no game 'Chess'"),
@@ -108,6 +108,6 @@ def test_a_measure_is_used_only_where_it_exists_for_every_score() -> None:
         (["--workers", "0"], "at least 1 process"),
     ],
 )
-def test_mistakes_get_one_sentence(wrong: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_get_one_sentence(wrong: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*wrong, "--output", str(tmp_path)]) == 1
-    assert told in capsys.readouterr().out
+    assert message in capsys.readouterr().out

@@ -30,7 +30,7 @@ def test_the_true_model_is_not_wrong_and_one_that_knows_nothing_is() -> None:
     truth, states = outcomes(world, exact, numbers, actions), numbers[:, None]
     np.testing.assert_allclose(np.add.reduceat(truth.probabilities, truth.offsets[:-1]), 1.0)
     assert wrongness(known[0], truth, states, actions) == pytest.approx(0.0, abs=1e-9)
-    assert wrongness(TabularModel((16,), 4), truth, states, actions) > 0.5  # it says that nothing moves
+    assert wrongness(TabularModel((16,), 4), truth, states, actions) > 0.5  # predicts that no state changes
 
 
 def test_the_script_writes_table_and_picture_and_refuses_what_it_does_not_know(
@@ -44,10 +44,10 @@ def test_the_script_writes_table_and_picture_and_refuses_what_it_does_not_know(
     assert float(rows["random", 600]["tried"]) < 0.7
     assert float(rows["auto", 600]["error"]) < float(rows["random", 600]["error"])
     assert (tmp_path / "coverage.png").read_bytes()[:4] == b"\x89PNG"
-    for wrong, told in (
+    for wrong, expected in (
         (["--explorations", "bold"], "bold"),
-        (["--worlds", "CartPole, binned"], "not at hand"),
+        (["--worlds", "CartPole, binned"], "not available"),
         (["--marks", "20", "10"], "ascending"),
     ):
         assert main(wrong) == 1
-        assert told in capsys.readouterr().out
+        assert expected in capsys.readouterr().out

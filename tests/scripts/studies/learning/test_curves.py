@@ -1,4 +1,4 @@
-"""Learning curves: what is planned, what a row holds, and the picture."""
+"""Learning curves: the planned cells, the rows, and the picture."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The textbook yardstick: its probabilities sum to one, and it learns what full tables can hold."""
+"""The textbook baseline: its probabilities sum to one, and it learns rules that full tables can represent."""
 
 import importlib.util
 

@@ -1,4 +1,4 @@
-"""What counts as certain, and a whole small run."""
+"""Certain factors, and a complete small run."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ def test_only_what_is_not_random_is_judged() -> None:
     order = np.random.default_rng(1).permutation(15)
     rows = random_play(GeyserRunner(), 300, 1, order)
     certain = certain_factors(geysers, rows, order, 1)
-    assert not certain.any()  # a third of the factors, where the geyser is, is random
+    assert not certain.any()  # a third of the factors, the geyser's position, is random
     maze = SimulatorModel(Maneuverer())
     rows = random_play(Maneuverer(), 1000, 1, np.arange(108))
     certain = certain_factors(maze, rows, np.arange(108), 1)
@@ -50,7 +50,7 @@ def test_a_small_run_is_written_and_shown(tmp_path: Path, capsys: pytest.Capture
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "expected"),
     [
         (["--cases", "Chess"], "no case 'Chess'"),
         (["--models"], "at least one model"),
@@ -61,6 +61,6 @@ def test_a_small_run_is_written_and_shown(tmp_path: Path, capsys: pytest.Capture
         (["--workers", "0"], "at least 1 process"),
     ],
 )
-def test_mistakes_get_one_sentence(wrong: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_get_one_sentence(wrong: list[str], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*wrong, "--output", str(tmp_path / "new")]) == 1
-    assert told in capsys.readouterr().out.replace("\n", " ")
+    assert expected in capsys.readouterr().out.replace("\n", " ")

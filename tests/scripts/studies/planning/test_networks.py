@@ -45,7 +45,7 @@ def test_the_first_goal_is_the_games_own() -> None:
 
 
 def test_exact_values_are_those_of_a_life_at_one_column() -> None:
-    # Only the last column pays: whoever stands there stays; from k columns off the first payment comes after k steps.
+    # Only the last column has rewards, and staying there is optimal; from k columns away the first reward follows after k steps.
     goal = PairwiseGoal(np.eye(WIDTH + HALF)[WIDTH - 1], np.zeros((WIDTH + HALF, WIDTH + HALF)))
     states, q = exact_values(goal, 0.9)
     steps = np.maximum(WIDTH - 1 - states[:, :WIDTH].argmax(axis=1), 1)

@@ -68,16 +68,16 @@ def greedy_in_leaf_values(world: RandomMDP) -> TableSearch:
 
 
 def test_without_peers_one_line_says_so_and_the_page_shows_the_rest(tmp_path: Path) -> None:
-    told: list[str] = []
+    messages: list[str] = []
     settings = Settings(worlds=2, roots=2, seeds=1, budgets=(4, 8), repetitions=1)
-    regrets, speeds = compare(settings, {"greedy": greedy_in_leaf_values}, told.append)
-    assert told[0] == "Peers are left out: --peers-python is not given."
+    regrets, speeds = compare(settings, {"greedy": greedy_in_leaf_values}, messages.append)
+    assert messages[0] == "Peers are left out: --peers-python is not given."
     assert len(regrets) == 4
     assert [(row.roots, row.simulations) for row in speeds] == [(1, 256), (1, 1024), (16, 1024)]
     pictures = write_page(tmp_path / "report.html", {"regret": [vars(row) for row in regrets], "speed": []}, "a command")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "What searches lose" in page
-    assert "Speed of searches on a table" not in page
+    assert "Regret of searches against the number of simulations" in page
+    assert "Speed of searches in tabular MDPs" not in page
     assert pictures["regret"].startswith(b"\x89PNG")
 
 

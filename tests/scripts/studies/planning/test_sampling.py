@@ -63,7 +63,7 @@ def test_the_limit_of_a_share_covers_it_as_often_as_it_says() -> None:
 
 @pytest.mark.parametrize("sweeps", [1, 3])
 def test_the_short_cut_draws_what_the_full_sweep_draws_where_the_conditioner_agrees(sweeps: int) -> None:
-    model = build_sampler("sweeps", 8, 1)  # a conditioner that adds nothing yet
+    model = build_sampler("sweeps", 8, 1)  # the untrained conditioner has no effect
     weights = {name: array * 4.0 if name == "predictor.stay" else array for name, array in model.state_dict().items()}
     model.load_state_dict(weights)
     states, actions = random_inputs(8, 3000, np.random.default_rng(0))

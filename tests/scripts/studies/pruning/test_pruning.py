@@ -1,4 +1,4 @@
-"""The pruning experiment: what it compares with, and what it refuses."""
+"""The pruning experiment: true dependencies, measures, and refused options."""
 
 from pathlib import Path
 
@@ -49,7 +49,7 @@ def test_a_perfect_model_agrees_with_the_truth() -> None:
 
 
 def outcome(seed: int, change: float) -> Outcome:
-    """As if FlierCatcher had been pruned without any loss of what is true."""
+    """The outcome of pruning FlierCatcher without losing any true dependency."""
     game, names = FlierCatcher(), tuple(f"observation[{i}]" for i in range(120))
     found = Outcome(Cell("flier_catcher", seed, SETTINGS), names, game.action_names)
     for number, key in enumerate(KEYS):

@@ -14,7 +14,7 @@ from studies.sampling_accuracy.measures import (
 
 
 def dense(distribution: Distribution, d: int) -> np.ndarray:
-    """Probabilities [n, 2^d], written out."""
+    """Full table of probabilities [n, 2^d]."""
     table = np.zeros((distribution.n, 2**d))
     table[distribution.inputs, distribution.outcomes.astype(np.int64)] = distribution.probabilities
     return table
@@ -65,7 +65,7 @@ def test_a_correlation_without_variation_is_undefined() -> None:
 
 
 def test_the_papers_measure_rewards_stray_mass() -> None:
-    # A sampler that spreads 2% over many wrong outcomes scores higher than one that is right but for sampling noise.
+    # A sampler that spreads 2% over many wrong outcomes scores higher than one that is exact except for sampling noise.
     truth = random_distribution(0, n=20, d=10, draws=4)
     noisy = Distribution(truth.inputs, truth.outcomes, truth.probabilities * 0.98, truth.n)
     stray = (np.arange(400) + 1000).astype(np.uint64)

@@ -1,4 +1,4 @@
-"""Samplers, scores and the page, on data small enough to fit in moments."""
+"""Samplers, scores and the page, on small data that is fitted quickly."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -38,7 +38,7 @@ def test_the_perfect_sampler_is_perfect_and_its_draws_are_close() -> None:
     drawn = samplers.draw(model, DATA, 4000, seed=1)
     assert valid_mass(truth, drawn) == pytest.approx(1.0)
     assert total_variation(truth, drawn) < 0.05
-    # Every probability is a multiple of 1 / c, so c systematic draws hit it exactly.
+    # Every probability is a multiple of 1 / c, so c systematic samples reproduce it exactly.
     assert total_variation(truth, samplers.draw_systematically(model, DATA, 4, 5)) == pytest.approx(0.0, abs=1e-12)
     assert total_variation(truth, samplers.draw(model, DATA, 4, 5)) > 0.1
 
@@ -95,7 +95,7 @@ def score(trial: str, sampler: str, union: float, **more: float) -> Score:
 
 
 def some_seeds(given: Score) -> list[Score]:
-    """Three data sets, nearly alike."""
+    """Three nearly equal data sets."""
     return [
         replace(given, seed=i, union=given.union + 0.001 * i, valid=given.valid + 0.001 * i, at_zero=0.01 + 0.001 * i)
         for i in range(3)
@@ -164,7 +164,7 @@ def test_a_whole_run_becomes_one_page_and_one_table(tmp_path: Path) -> None:
 
 def test_weights_are_counted_without_the_pruned_ones() -> None:
     _, combined = samplers.fit_paper(DATA, FitOptions(iterations=1), 0)
-    # d = 3 and, as a fourth output, the end. Predictor: 4 inputs, 7 nodes. Conditioner: 6 nodes in each of 4 groups, each with
+    # d = 3 and a fourth output, termination. Predictor: 4 inputs, 7 nodes. Conditioner: 6 nodes in each of 4 groups, each with
     # 4 inputs, 3 other outputs, a threshold and a weight to its output; 4 thresholds.
     assert size(combined) == (4 * 7 + 7) + (7 * 4 + 4) + 4 * 6 * (4 + 3 + 1 + 1) + 4
 
@@ -178,7 +178,7 @@ def test_settings_come_back_from_disk(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "expected"),
     [
         (["--trials", "9"], "no trial '9'"),
         (["--trials", "d = 2"], "no trial 'd = 2'"),
@@ -192,10 +192,10 @@ def test_settings_come_back_from_disk(tmp_path: Path) -> None:
         (["--report-only"], "no results"),
     ],
 )
-def test_mistakes_get_one_sentence(wrong: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_get_one_sentence(wrong: list[str], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*wrong, "--output", str(tmp_path / "new")]) == 1
-    assert told in capsys.readouterr().out
-    assert not (tmp_path / "new").exists()  # nothing was begun
+    assert expected in capsys.readouterr().out
+    assert not (tmp_path / "new").exists()  # no run was started
 
 
 def test_wrong_fit_options_are_told_by_name(capsys: pytest.CaptureFixture[str]) -> None:
@@ -218,7 +218,7 @@ def test_earlier_results_are_kept_or_gone_on_with(tmp_path: Path, capsys: pytest
     assert main(["--report-only", "--relates", "input", "--output", str(tmp_path)]) == 0
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "9 draws an input" in page
-    assert "the output variable set before it" in page  # what it was measured with, not what this command says
+    assert "the output variable set before it" in page  # the settings of the measurement, not those of this command
     both = (tmp_path / "results.csv").read_text(encoding="utf-8")
     assert main([*options, "--seeds", "1"]) == 0
     assert (tmp_path / "earlier-1" / "results.csv").read_text(encoding="utf-8") == both
