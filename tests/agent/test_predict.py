@@ -219,7 +219,7 @@ def test_a_kept_tree_is_dropped_at_episode_starts_and_with_goals(learned: dict[s
     [
         ("MctsPolicy", {"num_simulations": 0}, "num_simulations must be a whole number of at least 1"),
         ("MctsPolicy", {"horizon": 0}, "horizon must be a whole number of at least 1"),
-        ("MctsPolicy", {"gamma": 1.5}, "gamma must lie between 0 and 1, both excluded, got 1.5: the values of worlds"),
+        ("MctsPolicy", {"gamma": 1.5}, "gamma must lie between 0 and 1, both excluded, got 1.5: values of endless"),
         ("MctsPolicy", {"gamma": 0.0}, "gamma must lie between 0 and 1"),
         ("MctsPolicy", {"gamma": -0.5}, "gamma must be a finite number that is not negative"),
         ("MctsPolicy", {"time_budget": 0.0}, "time_budget must be a finite number of seconds above 0"),
