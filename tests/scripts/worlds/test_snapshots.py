@@ -28,7 +28,7 @@ def test_outcomes_are_those_of_the_rules() -> None:
     assert not over.any()
     assert set(drawn[:, 0]) <= {0, 1, 4}
     assert (tried.reward(np.zeros(4, dtype=np.int64), actions, drawn[:, 0]) == 0.0).all()
-    with pytest.raises(ValueError, match="never met"):
+    with pytest.raises(ValueError, match="never observed"):
         tried.successors(np.array([[15]]), np.array([0]), 1, 0)
 
 
