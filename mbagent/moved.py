@@ -14,6 +14,10 @@ from typing import Any
 _PACKAGE = "mbagent."
 
 _FORMERLY = {
+    "evaluation": "analysis",
+    "evaluation.baselines": "analysis.baselines",
+    "evaluation.evaluate": "analysis.evaluation",
+    "evaluation.statistics": "analysis.statistics",
     "agent": "pruned",
     "checkpoint agent": "saving",
     "checkpoint": "persistence",

@@ -10,7 +10,7 @@ from mbagent.data import TransitionBatch, TransitionDataset
 SOME_ROWS, SOME_TESTS = 2500, 1000
 """Maximum numbers of transitions for fits and for held-out tests in quick decisions between candidates."""
 
-FORETOLD = -1e-3
+PERFECT_LOG_PROB = -1e-3
 """Mean log-probability above which predictions are considered perfect, so that no candidate can improve them."""
 
 

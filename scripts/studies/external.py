@@ -28,8 +28,8 @@ from mbagent.learned_env import LearnedEnv
 from worlds.known_rules import exact_world, scale_of, true_model
 from worlds.registry import ARCADE, CONTINUOUS, WORLDS, World, for_networks
 
-OURS, TRUE, IMAGINED = "mbagent", "mbagent, true model", "PPO in LearnedEnv"
-AGENTS = (OURS, TRUE, "PPO", "DQN", IMAGINED, "random")
+OURS, TRUE, IN_LEARNED_ENV = "mbagent", "mbagent, true model", "PPO in LearnedEnv"
+AGENTS = (OURS, TRUE, "PPO", "DQN", IN_LEARNED_ENV, "random")
 """Agents: this one; its planner on the true rules; SB3's; SB3's PPO trained in the learned environment; random play."""
 
 TIMED = 100
@@ -109,12 +109,12 @@ def _players(cell: Cell) -> Sequence[Callable[[], Player]]:
         assert isinstance(space, gym.spaces.Discrete)
         return (partial(Player, random_policy(int(space.n), cell.seed), 0, 0.0, False),)
     make_env: Callable[[], gym.Env[Any, Any]] = cell.world.make_for_networks
-    if cell.agent == IMAGINED:
+    if cell.agent == IN_LEARNED_ENV:
         env = cell.world.make()
         agent = _learned(cell, env)
         limit = _limit(env)
         make_env = partial(_learned_env, agent, limit)
-    name = cast("BaselineName", "PPO" if cell.agent == IMAGINED else cell.agent)
+    name = cast("BaselineName", "PPO" if cell.agent == IN_LEARNED_ENV else cell.agent)
     began = time.perf_counter()
     algorithm, _ = train_baseline(
         name,

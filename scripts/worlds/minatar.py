@@ -134,5 +134,5 @@ def minatar(seed: int, full: bool, variant: Variant | None = None) -> list[Row]:
     channels = Frames(name, sticky).n_channels
     hit = (shown[0][:, :channels] == shown[1][:, :channels]).all(axis=(1, 2, 3))
     figures = {"exact frame": float(hit.mean()), "ceiling": ceiling, "fit seconds": report.seconds}
-    figures["end foretold"] = float((ends == test.terminated).mean())
+    figures["end predicted"] = float((ends == test.terminated).mean())
     return [{**variant._asdict(), "steps": steps, **figures}]

@@ -17,7 +17,7 @@ import numpy as np
 from mbagent.data import TransitionBatch
 from mbagent.models.dbn.features import Layout, Observed, Question, action_features, ask, question
 from mbagent.models.dbn.smoothing import Pools, Smoothing, smoothing_of
-from mbagent.models.held_out import FORETOLD, better, thinned
+from mbagent.models.held_out import PERFECT_LOG_PROB, better, thinned
 from mbagent.types import Bools, Floats, Ints
 
 SURE_GAIN = 5.0
@@ -193,7 +193,7 @@ def best_effect_models(
     logs, changes = (log_probs([effect_model] * n_factors) for effect_model in (ABSOLUTE_EFFECT, EffectModel(Effect.RELATIVE)))
     relative = (changes - logs).sum(axis=0) > 0.0
     best, logs = [EffectModel(Effect.RELATIVE) if r else ABSOLUTE_EFFECT for r in relative], np.where(relative, changes, logs)
-    random = np.flatnonzero(logs.mean(axis=0) < FORETOLD).tolist()
+    random = np.flatnonzero(logs.mean(axis=0) < PERFECT_LOG_PROB).tolist()
     likely = operands() if random else []
     if not any(likely[i] for i in random):
         return best

@@ -23,7 +23,7 @@ from mbagent.models.dbn.predictions import GraphPredictions
 from mbagent.models.dbn.serialization import SAVED, from_arrays, table_of, to_arrays
 from mbagent.models.dbn.smoothing import smoothing_of
 from mbagent.models.fit_report import Variable, VariableReport, describe
-from mbagent.models.held_out import FORETOLD, SOME_ROWS, SOME_TESTS, better, thinned, within
+from mbagent.models.held_out import PERFECT_LOG_PROB, SOME_ROWS, SOME_TESTS, better, thinned, within
 from mbagent.models.markov_test import steps_in_a_row, with_past
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.types import Bools, Floats
@@ -227,7 +227,7 @@ class DecisionGraphModel(GraphPredictions):
         if min(len(known[0]), len(tests[0])) < 2:
             return None
         logs = self._quick_log_probs(known[0], tests[0])
-        if logs.mean() > FORETOLD:
+        if logs.mean() > PERFECT_LOG_PROB:
             return 0.0
         space, longer = with_past(*known, self.cardinalities, self.encoding, self._planes())
         _, longer_tests = with_past(*tests, self.cardinalities, self.encoding, self._planes())

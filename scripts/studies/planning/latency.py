@@ -80,7 +80,7 @@ def measure(setting: Setting, seed: int, scale: Scale, episodes: int) -> list[Ro
         score = float(interquartile_mean(normalised(returns, scale.random, scale.reference)))
         rows.append(
             {"game": setting.key, "reward": name, "simulations": setting.num_simulations,
-             "states imagined": setting.settings.get("lookahead_states", 160), "ms a decision": ours, "PPO, ms": theirs,
+             "lookahead states": setting.settings.get("lookahead_states", 160), "ms a decision": ours, "PPO, ms": theirs,
              "times PPO": ours / theirs, "once for a goal, ms": 1e3 * once, "normalised": score}
         )  # fmt: skip
     return rows

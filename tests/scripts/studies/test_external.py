@@ -10,14 +10,14 @@ import pytest
 
 from external_benchmark import Args, cells, main
 from harness import write_csv
-from studies.external import IMAGINED, OURS, TRUE, Cell, markdown_table, run_cell
+from studies.external import IN_LEARNED_ENV, OURS, TRUE, Cell, markdown_table, run_cell
 from worlds.known_rules import scale_of
 from worlds.registry import CONTINUOUS, WORLDS, World, find_world, for_networks
 
 LAKE = find_world("FrozenLake 4x4")
 
 
-@pytest.mark.parametrize("agent", [OURS, TRUE, "PPO", IMAGINED, "random"])
+@pytest.mark.parametrize("agent", [OURS, TRUE, "PPO", IN_LEARNED_ENV, "random"])
 def test_agents_are_scored_on_one_scale(agent: str) -> None:
     (row,) = run_cell(Cell(LAKE, agent, seed=0, steps=10_000, episodes=5, baseline_steps=1000)).rows
     assert row["optimum"] == pytest.approx(0.744, abs=0.001)

@@ -38,7 +38,7 @@ from mbagent.models.dbn.serialization import SAVED, from_arrays, table_of, to_ar
 from mbagent.models.dbn.smoothing import smoothing_of
 from mbagent.models.dbn.splits import Search
 from mbagent.models.fit_report import Variable
-from mbagent.models.held_out import FORETOLD, SOME_ROWS, SOME_TESTS, better, thinned
+from mbagent.models.held_out import PERFECT_LOG_PROB, SOME_ROWS, SOME_TESTS, better, thinned
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.types import Bools, Floats, Ints
 
@@ -325,12 +325,12 @@ class LocalGraphModel(DecisionGraphModel):
         some, tests = thinned(train, SOME_ROWS), thinned(held_out, SOME_TESTS)
         best, logs = Reach(), self._reach_log_probs(Reach(), some, tests)
         most = min(LARGEST_RADIUS, max(self.board.height, self.board.width) // 2)
-        while best.radius < most and logs.mean() < FORETOLD:
+        while best.radius < most and logs.mean() < PERFECT_LOG_PROB:
             further = self._reach_log_probs(Reach(best.radius + 1), some, tests)
             if not better(further, logs):
                 break
             best, logs = Reach(best.radius + 1), further
-        if logs.mean() < FORETOLD and better(self._reach_log_probs(best._replace(wrap=True), some, tests), logs):
+        if logs.mean() < PERFECT_LOG_PROB and better(self._reach_log_probs(best._replace(wrap=True), some, tests), logs):
             best = best._replace(wrap=True)
         return best
 
@@ -520,7 +520,12 @@ class PlaneGraphModel(LocalGraphModel):
             loss: mean held-out loss of the tied model, in nats; None if no transitions were held out.
         """
         some, tests = thinned(train, SOME_ROWS), thinned(held_out, SOME_TESTS)
-        if loss is None or loss < -FORETOLD or len(self.cardinalities) > MOST_UNTIED_CELLS or min(len(some), len(tests)) < 2:
+        if (
+            loss is None
+            or loss < -PERFECT_LOG_PROB
+            or len(self.cardinalities) > MOST_UNTIED_CELLS
+            or min(len(some), len(tests)) < 2
+        ):
             return False
         flat = DecisionGraphModel(self.cardinalities, self.n_actions, parts=self.parts)
         flat.fitted = fit_graphs(self.cardinalities, self.encoding, some, np.zeros(len(some), dtype=np.bool_), False, False)
