@@ -6,6 +6,7 @@ scores thousands of transitions for a decision.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -24,7 +25,7 @@ from mbagent.models.neural.networks import Affine, Convolution, FactorCodec, cel
 from mbagent.models.neural.training import one_thread
 from mbagent.models.reward_changes import still_hold, triples, turn
 from mbagent.spaces import PlaneLayout
-from mbagent.types import Actions, Floats, Ints, States
+from mbagent.types import Actions, Bools, Floats, Ints, States
 from mbagent_envs.jit import compiled
 
 HIDDEN = 64
@@ -126,6 +127,15 @@ HELD_OUT = 0.15
 
 _CHUNK = 256
 
+CLEARLY = 3.0
+"""Difference of held-out log-likelihoods, in nats, from which graphs or a network are clearly better."""
+
+FEWEST_MISSED = 4
+"""Minimum number of episodes with rewards that graphs miss, for a test of whether a network predicts half from the others."""
+
+LEAST_PROBABILITY = 1e-4
+"""Probabilities below this count as this much in comparisons."""
+
 
 CONTRARY, WRONG = 0.02, 0.1
 """Shares of transitions with contradictory rewards, and of held-out ones with wrong predictions, above which advice is given."""
@@ -139,8 +149,8 @@ class RewardReport:
         n_values: number of distinct observed rewards.
         right: share of transitions whose predicted reward is right within 0.5% of the range of rewards.
         held_out: the same for the episodes held out in the first fit, as measured then; NaN if there are none.
-        contrary: share of transitions with another reward than the most frequent one of their (observation, action, next
-            observation).
+        contrary: share of transitions with another reward than the most frequent one of those that cannot be distinguished: with
+            the same observation, action and next observation, or with the same prediction of decision graphs.
         since: number of transitions before the last change of rewards; 0 if there was none. The other figures refer to the
             transitions whose rewards are still valid.
     """
@@ -163,8 +173,8 @@ class RewardReport:
         if self.contrary > CONTRARY:
             return (
                 f"{self.contrary:.1%} of rewards differ from what the same observation, action and next observation earned "
-                "before, so the reward is random or depends on something unobserved (time, history); the agent plans with mean "
-                "rewards. mbagent.wrappers.History may add what is missing."
+                "otherwise, as far as the reward was found to depend on them; so it is random or depends on something unobserved "
+                "(time, history), and the agent plans with mean rewards. mbagent.wrappers.History may add what is missing."
             )
         if self.held_out < 1.0 - WRONG:
             return (
@@ -235,59 +245,77 @@ class LearnedReward:
             chosen = np.random.default_rng(self._seed).permutation(episodes)[: int(HELD_OUT * len(episodes))]
             held = np.isin(rows.episodes, chosen)
             if held.any():
-                held_out, clearly = self._choose(rows.select(np.flatnonzero(~held)), rows.select(np.flatnonzero(held)))
+                held_out, gain = self._choose(rows, held)
+                if abs(gain) <= CLEARLY:  # rare rewards may be missing in the test rows
+                    missed = self._half_of_missed(rows)
+                    gain = self._choose(rows, missed)[1] if missed.any() else gain
+                clearly = gain > CLEARLY
             if self._graphs is not None or not held.any():
                 self._graphs = self._as_graphs(rows)
             trained = held.any() and self._graphs is None
             if self._graphs is not None and not clearly:
-                misses = self._missed(rows) > 0 or (not held.any() and self._share_right(distinct, weights) < 1.0)
+                misses = self._missed(rows).any() or (not held.any() and self._share_right(distinct, weights) < 1.0)
                 self._graphs = None if misses else self._graphs
             if self._graphs is None:
                 self._train(distinct, torch.from_numpy(weights), TRAINING_STEPS // 2 if trained else TRAINING_STEPS)
         right = self._share_right(distinct, weights)
-        return RewardReport(len(values), right, held_out, _contrary_share(rows))
+        contrary = _contrary_share(rows)
+        if self._graphs is not None:
+            chances = self._graph_chances(rows.states, rows.actions, rows.next_states)
+            contrary = max(contrary, _contrary_share(rows, np.unique(chances, axis=0, return_inverse=True)[1].ravel()))
+        return RewardReport(len(values), right, held_out, contrary)
 
-    def _choose(self, train: TransitionBatch, tests: TransitionBatch) -> tuple[float, bool]:
-        """Fits graphs and, unless they are perfect, a network; keeps the one that predicts the test rows better.
+    def _choose(self, rows: TransitionBatch, held: Bools) -> tuple[float, float]:
+        """Fits graphs and, unless they are perfect, a network; keeps the one that predicts the held-out rows better.
 
-        Graphs need evidence for a split, so they may miss a reward that was observed once or twice; if the test rows show no
-        difference, the number of such misses decides.
+        Graphs need evidence for a split, so they may miss a reward that was observed once or twice; if the held-out rows show no
+        clear difference, the number of such misses decides.
 
         Returns:
-            (share of test rows with the right reward, whether graphs are clearly better).
+            (share of held-out rows with the right reward, held-out log-likelihood of graphs minus that of the network, infinite
+            if only one of them was fitted).
         """
+        train, tests = rows.select(np.flatnonzero(~held)), rows.select(np.flatnonzero(held))
         graphs = self._graphs = self._as_graphs(train)
         if graphs is None:
             self._train_on(train)
-            return self._share_right(tests), False
-        missed, errors, right = self._missed(train), self._errors(tests), self._share_right(tests)
+            return self._share_right(tests), -math.inf
+        missed, logs, right = self._missed(train).sum(), self._log_likelihood(tests), self._share_right(tests)
         if right == 1.0 and missed == 0:
-            return right, False
+            return right, math.inf
         self._graphs = None
         self._train_on(train)
-        gain, fewer_misses = self._errors(tests) - errors, missed <= self._missed(train)
-        spread = 2.0 * float(gain.std()) / len(gain) ** 0.5
-        # With random rewards, test rows hardly distinguish means, and those of graphs are the means of the training rows.
-        least = -spread if _contrary_share(train) > 0.0 else 0.0
-        if gain.mean() > spread or (gain.mean() >= least and fewer_misses):
+        gain, fewer_misses = logs - self._log_likelihood(tests), missed <= self._missed(train).sum()
+        # Test rows hardly distinguish means of random rewards, and those of graphs are the means of the training rows.
+        least = -CLEARLY if _contrary_share(train) > 0.0 else 0.0
+        if gain > CLEARLY or (gain >= least and fewer_misses):
             self._graphs = graphs
-            return right, bool(gain.mean() > spread)
-        return self._share_right(tests), False
+            return right, gain
+        return self._share_right(tests), gain
+
+    def _half_of_missed(self, rows: TransitionBatch) -> Bools:
+        """Rows of every second episode with rewards that graphs miss, bool [N]; none if graphs miss few."""
+        before, self._graphs = self._graphs, self._as_graphs(rows)
+        episodes = np.unique(rows.episodes[self._missed(rows)])
+        self._graphs = before
+        return np.isin(rows.episodes, episodes[::2] if len(episodes) >= FEWEST_MISSED else [])
 
     def _train_on(self, rows: TransitionBatch) -> None:
         distinct, weights = _distinct(rows)
         self._train(distinct, torch.from_numpy(weights), TRAINING_STEPS)
 
-    def _missed(self, rows: TransitionBatch) -> int:
-        """Number of rows with a non-default reward that is predicted as the default.
+    def _missed(self, rows: TransitionBatch) -> Bools:
+        """Which rows [N] have a non-default reward that is predicted as the default.
 
         Their rewards are averaged over all rows with the same observation, action and next observation, which cannot be
         distinguished.
         """
         off, numbers = self._order[0], _triple_indices(rows)
         means = (np.bincount(numbers, weights=rows.rewards) / np.bincount(numbers))[numbers]
+        away = np.abs(means - off)
         predicted = np.abs(self(rows.states, rows.actions, rows.next_states) - off)
-        return int((predicted < 0.5 * np.abs(means - off)).sum())
+        missed: Bools = (predicted < 0.5 * away) & (away > 1e-9 * np.ptp(self._values))
+        return missed
 
     def _as_graphs(self, rows: TransitionBatch) -> ClassGraphs | None:
         """Decision graphs for the rewards of some rows; None if there are too many distinct ones."""
@@ -357,10 +385,21 @@ class LearnedReward:
         gain = errors[0] - errors[1]
         return found if gain.mean() > 2.0 * gain.std() / len(gain) ** 0.5 else 0
 
-    def _errors(self, rows: TransitionBatch) -> Floats:
-        """Squared errors [N]."""
-        errors: Floats = (self(rows.states, rows.actions, rows.next_states) - rows.rewards) ** 2
-        return errors
+    def _log_likelihood(self, rows: TransitionBatch) -> float:
+        """Log-probability of the rewards of all rows, predicted as classes."""
+        if self._graphs is not None:
+            chances = self._graph_chances(rows.states, rows.actions, rows.next_states)[:, np.argsort(np.argsort(self._order))]
+        else:
+            chances = self._outputs(rows.states, rows.actions, rows.next_states).double().softmax(dim=1).numpy()
+        own = chances[np.arange(len(rows)), np.searchsorted(self._values, rows.rewards)]
+        return float(np.log(np.maximum(own, LEAST_PROBABILITY)).sum())
+
+    def _graph_chances(self, states: States, actions: Actions, next_states: States) -> Floats:
+        """Probability of each reward, in the order of ``_order``, [M, K], from the graphs."""
+        assert self._graphs is not None
+        arrays = (np.ascontiguousarray(part, dtype=np.int64) for part in (states, actions, next_states))
+        chances: Floats = class_chances(self._graphs, len(self._order), *arrays)
+        return chances
 
     def _share_right(self, rows: TransitionBatch, weights: NDArray[np.float32] | None = None) -> float:
         value_range = float(np.ptp(self._values)) if self._classes else 6.0 * float(self._values[1])
@@ -400,25 +439,27 @@ class LearnedReward:
         self._packed = pack_reward(self._network) if isinstance(self._network, DenseReward) else None
 
     @one_thread()
-    @torch.inference_mode()
     def __call__(self, states: States, actions: Actions, next_states: States) -> Floats:
         """Expected rewards float64 [M]; those of a row do not depend on the other rows."""
         if len(self._values) == 1:
             return np.full(len(actions), self._values[0])
         if self._graphs is not None:
-            arrays = (np.ascontiguousarray(part, dtype=np.int64) for part in (states, actions, next_states))
-            return _expected_values(class_chances(self._graphs, len(self._order), *arrays), self._order)
+            return _expected_values(self._graph_chances(states, actions, next_states), self._order)
+        return self._expected(self._outputs(states, actions, next_states)).numpy()
+
+    @torch.inference_mode()
+    def _outputs(self, states: States, actions: Actions, next_states: States) -> Tensor:
+        """Outputs of the network [M, n_out]; those of a row do not depend on the other rows."""
         if self._packed is not None:
-            return self._expected(torch.from_numpy(reward_outputs(self._packed, states, actions, next_states))).numpy()
-        parts = [np.zeros(0)]
+            return torch.from_numpy(reward_outputs(self._packed, states, actions, next_states))
+        parts = [torch.zeros((0, len(self._values) if self._classes else 1))]
         for start in range(0, len(actions), _CHUNK):
             rows = [np.ascontiguousarray(part[start : start + _CHUNK]) for part in (states, actions, next_states)]
             n = len(rows[1])
             # Always the same size, since the rounding of matrix products depends on it.
             padded = [np.concatenate([part, np.zeros((_CHUNK - n, *part.shape[1:]), part.dtype)]) for part in rows]
-            out = self._network(*(torch.from_numpy(part) for part in padded))[:n]
-            parts.append(self._expected(out).numpy())
-        return np.concatenate(parts)
+            parts.append(self._network(*(torch.from_numpy(part) for part in padded))[:n])
+        return torch.cat(parts)
 
     def _expected(self, out: Tensor) -> Tensor:
         if not self._classes:
@@ -504,9 +545,10 @@ def _triple_indices(rows: TransitionBatch) -> NDArray[np.int64]:
     return result
 
 
-def _contrary_share(rows: TransitionBatch) -> float:
-    """Share of rows whose reward is not the commonest one of the same (s, a, s')."""
+def _contrary_share(rows: TransitionBatch, keys: Ints | None = None) -> float:
+    """Share of rows whose reward is not the commonest one of those with the same key [N]; by default (s, a, s')."""
+    keys = triples(rows) if keys is None else keys
     bits = np.ascontiguousarray(rows.rewards + 0.0, dtype=np.float64).view(np.int64)  # -0.0 is 0.0
-    pairs, counts = np.unique(np.stack([triples(rows), bits], axis=1), axis=0, return_counts=True)
+    pairs, counts = np.unique(np.stack([keys, bits], axis=1), axis=0, return_counts=True)
     first = np.flatnonzero(np.r_[True, pairs[1:, 0] != pairs[:-1, 0]])
     return 1.0 - float(np.maximum.reduceat(counts, first).sum()) / len(rows.actions)

@@ -154,3 +154,33 @@ def test_weights_are_restored() -> None:
     other.load_state_dict(model.state_dict())
     given = data.states, data.actions, data.next_states
     np.testing.assert_array_equal(model(*given), other(*given))
+
+
+@pytest.mark.parametrize(("chance", "n_noise"), [(0.08, 0), (0.08, 4), (0.02, 6)])
+def test_random_rewards_are_predicted_by_their_mean_whatever_else_varies(chance: float, n_noise: int) -> None:
+    rng, n = np.random.default_rng(3), 8000
+    position, actions = np.arange(n) % 6, rng.integers(2, size=n)
+    before, after = (np.column_stack([p, rng.integers(2, size=(n, n_noise))]) for p in (position, (position + 1) % 6))
+    mine = (position == 3) & (actions == 1)
+    hit = mine & (rng.random(n) < chance)
+    rewards = np.where(hit, -20.0, np.where(mine, 1.0, 0.1))
+    data = TransitionBatch(before, actions, after, hit, rewards, np.arange(n) // 50)
+    model = LearnedReward((6,) + (2,) * n_noise, 2)
+    model.fit(data)
+    predicted = model(before, actions, after)
+    np.testing.assert_allclose(predicted[mine], rewards[mine].mean(), atol=1e-9)
+    np.testing.assert_allclose(predicted[~mine], 0.1, atol=1e-9)
+
+
+def test_random_rewards_of_transitions_that_hardly_recur_are_reported() -> None:
+    data = rows(4000)
+    wide = [
+        np.column_stack([part, np.random.default_rng(i).integers(2, size=(4000, 12))])
+        for i, part in enumerate((data.before, data.after))
+    ]
+    lost = np.random.default_rng(5).random(4000) < 0.2
+    rewards = np.where(lost, 5.0, data.rewards)
+    report = LearnedReward((2,) * 16, 3).fit(replace(data, before=wide[0], after=wide[1], rewards=rewards))
+    assert report.contrary == pytest.approx(0.2, abs=0.03)
+    assert report.advice is not None
+    assert "random" in report.advice

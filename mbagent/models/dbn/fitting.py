@@ -62,6 +62,26 @@ def flag_resets(states: Factors, next_states: Factors) -> Bools:
     return resets
 
 
+class Resets(NamedTuple):
+    """Rare transitions with graphs of their own: resets, which redraw almost everything, and joint events.
+
+    Attributes:
+        rows: which transitions these are, bool [N].
+        redrawn: the factors, and last ``terminated``, that have graphs of their own in them, bool [F + 1]; others have the usual
+            ones.
+        jointly: whether to search for synchronic arcs between the redrawn variables.
+    """
+
+    rows: Bools
+    redrawn: Bools
+    jointly: bool = False
+
+
+def all_redrawn(rows: Bools, n_factors: int) -> Resets:
+    """Resets [N] that redraw everything."""
+    return Resets(rows, np.ones(n_factors + 1, dtype=np.bool_))
+
+
 UNCERTAIN = 2.0
 """Variance summed over all rows from which a feature counts as uncertain."""
 
@@ -144,6 +164,14 @@ def _minority(spread: Floats) -> Floats:
     return result
 
 
+def feature_owners(layout: Layout) -> Ints:
+    """Variable of each feature, int64 [D']."""
+    variable_of = np.empty(layout.n_factors, dtype=np.int64)
+    variable_of[layout.members] = np.repeat(np.arange(len(layout.outputs)), np.diff(layout.first))
+    owner: Ints = variable_of[layout.factor]
+    return owner
+
+
 def find_dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, usual: Ints) -> list[Asked]:
     """Variables that may need synchronic arcs, in their order; ``terminated`` last, with the features of all changing variables.
 
@@ -153,10 +181,7 @@ def find_dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, usual:
         rows: N transitions.
         usual: numbers of those that are no resets, int64 [R].
     """
-    n_features, last = len(layout.factor), len(layout.outputs) - 2
-    variable_of = np.empty(layout.n_factors, dtype=np.int64)
-    variable_of[layout.members] = np.repeat(np.arange(len(layout.outputs)), np.diff(layout.first))
-    owner = variable_of[layout.factor]
+    n_features, last, owner = len(layout.factor), len(layout.outputs) - 2, feature_owners(layout)
     most = max(1000, MOST_ERRORS // max(n_features, 1))
     some = rows.select(usual[np.linspace(0, len(usual) - 1, min(len(usual), most)).astype(np.int64)])
     found = [Asked(variable, features) for variable, features in _dependent(layout, graphs, some, owner).items()]
@@ -204,6 +229,7 @@ class Fitted:
         usual: graphs of all variables without synchronic arcs, and of whether a reset happens.
         synchronic: graphs of the variables that are drawn after the others, given those variables' next values, in order.
         reset: graphs of the next state in a reset; as ``usual`` if there are no resets.
+        reset_synchronic: as ``synchronic``, in a reset.
         has_reset: whether there are resets.
         asked, found: questions and finished searches of ``usual`` and ``synchronic``.
     """
@@ -212,6 +238,7 @@ class Fitted:
     usual: Graphs
     synchronic: Graphs
     reset: Graphs
+    reset_synchronic: Graphs
     has_reset: bool
     asked: Sequence[Question]
     found: Sequence[Search]
@@ -219,9 +246,8 @@ class Fitted:
 
 def for_planning(fitted: Fitted) -> Fitted:
     """The graphs for planning, where negligible values are possible outcomes only if they were observed."""
-    noise = np.full(1, NEGLIGIBLE)
-    usual, synchronic, reset = (graphs._replace(noise=noise) for graphs in (fitted.usual, fitted.synchronic, fitted.reset))
-    return replace(fitted, usual=usual, synchronic=synchronic, reset=reset)
+    names = ("usual", "synchronic", "reset", "reset_synchronic")
+    return replace(fitted, **{name: getattr(fitted, name)._replace(noise=np.full(1, NEGLIGIBLE)) for name in names})
 
 
 class _Table:
@@ -283,14 +309,12 @@ class _Table:
         changing = (self.rows.before[observed] != self.rows.after[observed]).any(axis=0)
         return feature_kinds(self.layout, self.rows.before[observed], changing)
 
-    def build(self, questions: Sequence[Question], found: Sequence[Search], observed: Ints, still: float) -> Graphs:
-        """The graphs; smoothing is estimated from the observed rows."""
+    def build(self, questions: Sequence[Question], found: Sequence[Search], observed: Sequence[Ints], still: float) -> Graphs:
+        """The graphs; smoothing of each variable is estimated from its observed rows."""
         smoothings, n_action_classes = [], self.layout.encoding.n_action_classes
         for variable, cardinality in enumerate(self.layout.outputs):
-            some, (effect, operand) = (
-                self.observed(variable).select(self.counting(variable, observed)),
-                self.effects.get(variable, ABSOLUTE_EFFECT),
-            )
+            some = self.observed(variable).select(self.counting(variable, observed[variable]))
+            effect, operand = self.effects.get(variable, ABSOLUTE_EFFECT)
             smoothing = smoothing_for_effect(
                 effect, int(cardinality), n_action_classes if operand is None else operand.cardinality, some
             )
@@ -303,11 +327,31 @@ def no_synchronic(graphs: Graphs) -> Graphs:
     return graphs._replace(changing=np.zeros(0, dtype=np.int64), feature=np.full_like(graphs.feature, -1))
 
 
+class Part(NamedTuple):
+    """Graphs with the questions that they answer and the finished searches.
+
+    Attributes:
+        graphs: the graphs.
+        asked, found: questions and searches, in the same order.
+    """
+
+    graphs: Graphs
+    asked: Sequence[Question] = ()
+    found: Sequence[Search] = ()
+
+    def of(self, variables: Bools) -> tuple[list[Question], list[Search]]:
+        """Questions and searches of some variables, given as mask [U]."""
+        chosen = [
+            (question, search) for question, search in zip(self.asked, self.found, strict=True) if variables[question.variable]
+        ]
+        return [question for question, _ in chosen], [search for _, search in chosen]
+
+
 def fit_graphs(
     cardinalities: Sequence[int],
     encoding: ActionEncoding,
     rows: TransitionBatch,
-    resets: Bools,
+    resets: Resets,
     in_pairs: bool = True,
     jointly: bool = True,
     effects: Mapping[int, EffectModel] = NO_EFFECTS,
@@ -319,37 +363,76 @@ def fit_graphs(
         cardinalities: number of values of each factor.
         encoding: the actions.
         rows: N transitions.
-        resets: which of them are resets, bool [N].
+        resets: which of them are resets.
         in_pairs: whether to search for pairwise splits, which takes most of the time.
         jointly: whether to search for synchronic arcs.
         effects: effects of factors; absolute if missing.
         since: first row that counts for each factor and for ``terminated``, int64 [F + 1]; None for all.
     """
-    groups = find_groups(cardinalities, rows.before, rows.after, ~resets)
+    groups = find_groups(cardinalities, rows.before, rows.after, ~resets.rows)
     layout = make_layout(cardinalities, groups, encoding)
-    table, usual = _Table(layout, rows, resets, effects, since), np.flatnonzero(~resets)
+    table, usual = _Table(layout, rows, resets.rows, effects, since), np.flatnonzero(~resets.rows)
     last = len(layout.outputs) - 1
     rows_of = {variable: np.arange(len(rows)) if variable == last else usual for variable in range(last + 1)}
-    graphs, questions, found = _graphs(table, rows_of, usual, True, in_pairs)
-    layout = _with_mutexes(layout, graphs, rows)
-    synchronic = no_synchronic(graphs)
+    now = _graphs(table, rows_of, usual, True, in_pairs)
+    layout = _with_mutexes(layout, now.graphs, rows)
+    none = Part(no_synchronic(now.graphs))
+    synchronic = none
     if jointly:
-        synchronic, more_questions, more_found = _synchronic_graphs(table, layout, graphs, usual, in_pairs)
-        questions, found = [*questions, *more_questions], [*found, *more_found]
-    reset = graphs
-    if resets.any():
-        rare = np.flatnonzero(resets)
-        reset, _, _ = _graphs(table, dict.fromkeys(range(last), rare), rare, False, in_pairs)
-    return Fitted(layout, graphs, synchronic, reset, bool(resets.any()), questions, found)
+        dependent = find_dependent(layout, now.graphs, rows, usual)
+        synchronic = _synchronic_graphs(table, layout, now.graphs, usual, dependent, in_pairs)
+    reset, reset_synchronic = now, none
+    if resets.rows.any():
+        reset, reset_synchronic = _reset_graphs(table, layout, now, synchronic, resets, in_pairs)
+    return Fitted(
+        layout,
+        now.graphs,
+        synchronic.graphs,
+        reset.graphs,
+        reset_synchronic.graphs,
+        bool(resets.rows.any()),
+        [*now.asked, *synchronic.asked],
+        [*now.found, *synchronic.found],
+    )
+
+
+def _reset_graphs(
+    table: _Table, layout: Layout, usual: Part, synchronic: Part, resets: Resets, in_pairs: bool
+) -> tuple[Part, Part]:
+    """Graphs of the next state in a reset, without and with synchronic arcs."""
+    rare, last = np.flatnonzero(resets.rows), len(layout.outputs) - 1
+    own = np.zeros(last + 1, dtype=np.bool_)
+    own[:-2] = [resets.redrawn[layout.members[b:e]].any() for b, e in zip(layout.first, layout.first[1:-2], strict=False)]
+    own[-2] = resets.redrawn[-1]
+    reset = _graphs(table, dict.fromkeys(np.flatnonzero(own).tolist(), rare), rare, False, in_pairs)
+    if own[:-1].all() and not resets.jointly:
+        return reset, Part(no_synchronic(reset.graphs))
+    others, common = ~own, np.flatnonzero(~resets.rows)
+    others[last] = False
+    observed = [rare if own[variable] else common for variable in range(last + 1)]
+    questions, found = usual.of(others)
+    still = float(usual.graphs.still[0])
+    graphs = table.build([*reset.asked, *questions], [*reset.found, *found], observed, still)
+    late, late_found = synchronic.of(others)
+    if resets.jointly:
+        owner = feature_owners(layout)
+        earlier = [Asked(int(v), np.flatnonzero(own[owner] & (owner < v))) for v in np.flatnonzero(own)]
+        dependent = [each for each in earlier if len(each.features) and layout.mutex_of[each.variable] < 0]
+        arcs = _synchronic_graphs(table, layout, graphs, rare, dependent, in_pairs)
+        late, late_found = [*arcs.asked, *late], [*arcs.found, *late_found]
+    if not late:
+        return Part(graphs), Part(no_synchronic(graphs))
+    return Part(graphs), Part(table.build(late, late_found, observed, still))
 
 
 def _synchronic_graphs(
-    table: _Table, layout: Layout, graphs: Graphs, usual: Ints, in_pairs: bool
-) -> tuple[Graphs, list[Question], list[Search]]:
-    """Graphs of variables with synchronic arcs, with their questions and finished searches."""
+    table: _Table, layout: Layout, graphs: Graphs, usual: Ints, dependent: Sequence[Asked], in_pairs: bool
+) -> Part:
+    """Graphs of those variables, of the given ones, that depend on other variables' next values in some rows."""
     rows, kinds, n_features = table.rows, table.kinds(usual), table.features.shape[1]
-    synchronic, all_questions, all_found = [], [], []
-    for variable, features in find_dependent(layout, graphs, rows, usual):
+    all_questions: list[Question] = []
+    all_found: list[Search] = []
+    for variable, features in dependent:
         counting = table.counting(variable, usual)
         needed = uncertain_rows(rows.select(counting), layout, graphs, np.asarray([variable]))[:, 0]
         some = table.observed(variable).select(counting[needed])
@@ -361,13 +444,12 @@ def _synchronic_graphs(
         found = find_splits([q.target for q in questions], more, more_kinds, layout.encoding.n_action_classes, in_pairs)
         if any(split.feature >= n_features for search in found for split in search.splits):
             numbers = np.concatenate([np.arange(n_features), n_features + features])
-            synchronic.append(variable)
             all_questions += questions
             all_found += [search.renamed(numbers) for search in found]
-    if not synchronic:
-        return no_synchronic(graphs), [], []
-    built = table.build(all_questions, all_found, usual, float(graphs.still[0]))
-    return built._replace(changing=np.asarray(synchronic, dtype=np.int64)), all_questions, all_found
+    if not all_questions:
+        return Part(no_synchronic(graphs))
+    observed = [usual] * len(layout.outputs)
+    return Part(table.build(all_questions, all_found, observed, float(graphs.still[0])), all_questions, all_found)
 
 
 def _with_mutexes(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Layout:
@@ -395,10 +477,8 @@ def _cardinalities(layout: Layout) -> NDArray[np.int64]:
     return cardinalities
 
 
-def _graphs(
-    table: _Table, rows_of: dict[int, Ints], observed: Ints, regular: bool, in_pairs: bool
-) -> tuple[Graphs, list[Question], list[Search]]:
-    """Graphs of some variables, each fitted to the given rows; ``observed`` are the rows of this regime.
+def _graphs(table: _Table, rows_of: Mapping[int, Ints], observed: Ints, regular: bool, in_pairs: bool) -> Part:
+    """The graphs of some variables, each fitted to the given rows; ``observed`` are the rows of this regime.
 
     The probability that a variable which never changed does change is estimated from all variables together in a ``regular``
     regime, else for each by itself.
@@ -407,5 +487,6 @@ def _graphs(
     found = find_splits(
         [q.target for q in questions], table.features, table.kinds(observed), table.layout.encoding.n_action_classes, in_pairs
     )
-    still = 0.5 / (len(observed) * (len(table.layout.outputs) if regular else 1) + 1.0)
-    return table.build(questions, found, observed, still), questions, found
+    n_variables = len(table.layout.outputs)
+    still = 0.5 / (len(observed) * (n_variables if regular else 1) + 1.0)
+    return Part(table.build(questions, found, [observed] * n_variables, still), questions, found)

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,8 @@ from mbagent.models.dbn.arrays import Graphs, build, n_features
 from mbagent.models.dbn.change_points import last_changes
 from mbagent.models.dbn.effects import EffectModel, Operand, best_effect_models, candidates, likely_operands, more_folds
 from mbagent.models.dbn.features import Layout, action_encoding, is_lone_bit, layout_with_mutexes, make_layout
-from mbagent.models.dbn.fitting import ROWS_AT_ONCE, Fitted, fit_graphs, flag_resets, no_synchronic
+from mbagent.models.dbn.fitting import ROWS_AT_ONCE, Fitted, Resets, all_redrawn, fit_graphs, flag_resets, no_synchronic
+from mbagent.models.dbn.joint_events import Pattern, event_chances, excess, factors_of, find_patterns, settled
 from mbagent.models.dbn.mutex import find_groups
 from mbagent.models.dbn.predictions import GraphPredictions
 from mbagent.models.dbn.serialization import SAVED, from_arrays, table_of, to_arrays
@@ -131,39 +133,74 @@ class DecisionGraphModel(GraphPredictions):
         self.validation, self.parts = validation, (n_actions,) if parts is None else tuple(parts)
         if math.prod(self.parts) != n_actions:
             raise ValueError(f"Action parts with {self.parts} values make {math.prod(self.parts)} actions, not {n_actions}.")
-        self.encoding = action_encoding(self.parts)
+        self.encoding, self._with_resets = action_encoding(self.parts), False
         layout = make_layout(self.cardinalities, (), self.encoding)
         none = np.zeros(0, dtype=np.int64)
         nothing = build(
             layout, (), (), [smoothing_of(int(n), self.encoding.n_action_classes, none, none, none) for n in layout.outputs], 1e-9
         )
-        self.fitted = Fitted(layout, nothing, no_synchronic(nothing), nothing, False, (), ())
+        self.fitted = Fitted(layout, nothing, no_synchronic(nothing), nothing, no_synchronic(nothing), False, (), ())
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel."""
         began, n_observed = time.perf_counter(), len(data)
         data = within(data, MOST_VALUES)
         rows, resets = data.rows(), self._resets(data, seed)
+        self._with_resets = bool(resets.any())
         since = self._since(rows, resets)
         train, held_out, train_since = self._split(data, seed, since)
         if progress is not None:
             progress(0.4)
-        flagged = flag_resets(train.before, train.after) & resets.any()
+        flagged = flag_resets(train.before, train.after) & self._with_resets
         effects = self._effects(train, flagged, held_out)
-        self.fitted = fit_graphs(self.cardinalities, self.encoding, train, flagged, effects=effects, since=train_since)
+        fit = partial(fit_graphs, self.cardinalities, self.encoding, effects=effects)
+        self.fitted = fit(train, all_redrawn(flagged, len(self.cardinalities)), since=train_since)
         likelihood, jointly = self._compare_synchronic(held_out)
+        fit = partial(fit, jointly=jointly)
+        plain = self.fitted if jointly else replace(self.fitted, synchronic=no_synchronic(self.fitted.usual))
+        patterns = find_patterns(plain, rows.select(~resets & (np.arange(len(rows)) >= since.max(initial=0))))
+        if patterns and not self._fit_events(partial(fit, since=train_since), plain, patterns, train, flagged, held_out):
+            patterns = []
+        if patterns:
+            likelihood = self._likelihood(self.fitted, held_out)
         if progress is not None:
             progress(0.7)
         exact, (variables, calibration) = self._exact_match(held_out), self._described(held_out)
-        self.fitted = fit_graphs(self.cardinalities, self.encoding, rows, resets, True, jointly, effects, since)
+        redrawn = all_redrawn(resets, len(self.cardinalities))
+        if patterns:
+            events = settled(event_chances(self.fitted, rows, patterns)) & ~resets
+            redrawn = self._redrawn(resets, events, patterns)
+        self.fitted = fit(rows, redrawn, since=since)
         if progress is not None:
             progress(1.0)
-        figures = {"nodes": float(len(self.fitted.usual.feature)), "events": float(resets.sum())}
+        figures = {"nodes": float(len(self.fitted.usual.feature)), "events": float(redrawn.rows.sum())}
         figures |= {"changed": float((since > 0).sum()), "left out": float(n_observed - len(rows))}
         report = self._report((len(rows), len(held_out)), likelihood, exact, figures)
         memory = self._memory(train, held_out)
         report = replace(report, variables=variables, calibration=calibration, memory=memory)
         return replace(report, seconds=time.perf_counter() - began)
+
+    def _fit_events(
+        self,
+        fit: Callable[[TransitionBatch, Resets], Fitted],
+        plain: Fitted,
+        patterns: Sequence[Pattern],
+        train: TransitionBatch,
+        resets: Bools,
+        held_out: TransitionBatch,
+    ) -> bool:
+        """Fits the training rows with joint events, unless they predict clearly worse; returns whether they are kept."""
+        events = settled(excess(plain, train, patterns)) & ~resets
+        candidate = fit(train, self._redrawn(resets, events, patterns))
+        if better(self._logs(plain, held_out), self._logs(candidate, held_out)):
+            return False
+        self.fitted = candidate
+        return True
+
+    def _redrawn(self, resets: Bools, events: Bools, patterns: Sequence[Pattern]) -> Resets:
+        """Resets and joint events together: if there are resets, everything is redrawn."""
+        own = factors_of(self.fitted, patterns) | resets.any()
+        return Resets(resets | events, own, jointly=len(patterns) > 1 or bool(resets.any()))
 
     def _since(self, rows: TransitionBatch, resets: Bools) -> NDArray[np.int64]:
         """First row from which the present rules of each factor and of ``terminated`` hold, int64 [F + 1]."""
@@ -180,9 +217,10 @@ class DecisionGraphModel(GraphPredictions):
             logs[:, :-1][grouped & (tests.next_states == 0)] = 0.0  # only the bit that is on counts for a group
             return np.stack([logs[:, variable == v].sum(axis=1) for v in range(variable.max() + 1)], axis=1)
 
-        self.fitted = replace(self.fitted, has_reset=False)
+        self._with_resets, with_resets = False, self._with_resets
         since = last_changes(rows.select(usual), variable.max() + 1, log_predictive)
         self._restore(before)
+        self._with_resets = with_resets
         return np.where(since > 0, usual[since], 0)[variable]
 
     def _split(
@@ -251,7 +289,7 @@ class DecisionGraphModel(GraphPredictions):
 
     def _fit_quickly(self, rows: TransitionBatch) -> None:
         """Fits without synchronic arcs."""
-        resets = flag_resets(rows.before, rows.after) & self.fitted.has_reset
+        resets = all_redrawn(flag_resets(rows.before, rows.after) & self._with_resets, len(self.cardinalities))
         self.fitted = fit_graphs(self.cardinalities, self.encoding, rows, resets, True, False)
 
     def _snapshot(self) -> Any:
@@ -290,7 +328,12 @@ class DecisionGraphModel(GraphPredictions):
             train, held_out = data.split(self.validation, seed + split)
             observed = flag_resets(train.before, train.after)
             with_resets, without = (
-                self._likelihood(fit_graphs(self.cardinalities, self.encoding, train, flags, False, False), held_out)
+                self._likelihood(
+                    fit_graphs(
+                        self.cardinalities, self.encoding, train, all_redrawn(flags, len(self.cardinalities)), False, False
+                    ),
+                    held_out,
+                )
                 for flags in (observed, np.zeros_like(observed))
             )
             gain += (with_resets - without) * len(held_out)
@@ -321,7 +364,8 @@ class DecisionGraphModel(GraphPredictions):
         self, effect_models: Mapping[int, EffectModel], train: TransitionBatch, resets: Bools, held_out: TransitionBatch
     ) -> Floats:
         """Log-probability of the held-out next values of K factors under the given effects, [N, K]."""
-        self.fitted = fit_graphs(self.cardinalities, self.encoding, train, resets, False, False, effect_models)
+        flagged = all_redrawn(resets, len(self.cardinalities))
+        self.fitted = fit_graphs(self.cardinalities, self.encoding, train, flagged, False, False, effect_models)
         start = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64)
         probs, factors = self.marginals(held_out.states, held_out.actions), list(effect_models)
         chosen = np.take_along_axis(probs, start[factors] + held_out.after[:, factors], axis=1)
@@ -329,11 +373,16 @@ class DecisionGraphModel(GraphPredictions):
         return logs
 
     def _likelihood(self, fitted: Fitted, rows: TransitionBatch) -> float:
-        """Mean log-probability of transitions; impossible ones count as ``IMPOSSIBLE_LOG_PROB``."""
+        """Mean log-probability of transitions; see ``_logs``."""
+        return float(self._logs(fitted, rows).mean()) if len(rows) else 0.0
+
+    def _logs(self, fitted: Fitted, rows: TransitionBatch) -> Floats:
+        """Log-probability of each transition [N]; impossible ones count as ``IMPOSSIBLE_LOG_PROB``."""
         before, self.fitted = self.fitted, fitted
         parts = [self.log_prob(p.states, p.actions, p.next_states, p.terminated) for p in rows.parts(ROWS_AT_ONCE)]
-        self.fitted, logs = before, np.concatenate([np.zeros(0), *parts])
-        return float(np.maximum(logs, IMPOSSIBLE_LOG_PROB).mean()) if len(logs) else 0.0
+        self.fitted = before
+        logs: Floats = np.maximum(np.concatenate([np.zeros(0), *parts]), IMPOSSIBLE_LOG_PROB)
+        return logs
 
     def _exact_match(self, rows: TransitionBatch) -> float:
         hits = 0
@@ -356,7 +405,10 @@ class DecisionGraphModel(GraphPredictions):
             "couplings": fitted.layout.mutex_of.copy(),
             "has_event": np.asarray(fitted.has_reset),
         }
-        for name, graphs in (("usual", fitted.usual), ("late", fitted.synchronic), ("event", fitted.reset)):
+        named = {"usual": fitted.usual, "late": fitted.synchronic, "event": fitted.reset}
+        if len(fitted.reset_synchronic.changing):
+            named["late_event"] = fitted.reset_synchronic
+        for name, graphs in named.items():
             state.update({f"{name}.{part}": array for part, array in to_arrays(graphs).items()})
         return state
 
@@ -366,12 +418,8 @@ class DecisionGraphModel(GraphPredictions):
         Raises:
             ValueError: the arrays are not those of a model of these factors and actions; nothing is changed then.
         """
-        known = {
-            "groups",
-            "couplings",
-            "has_event",
-            *(f"{name}.{part}" for name in ("usual", "late", "event") for part in SAVED),
-        }
+        names = ["usual", "late", "event", *(["late_event"] if any(key.startswith("late_event.") for key in state) else [])]
+        known = {"groups", "couplings", "has_event", *(f"{name}.{part}" for name in names for part in SAVED)}
         wrong = sorted(known ^ set(state))
         if wrong:
             raise ValueError(f"These weights are not those of a decision graph model (first difference: {wrong[0]!r}).")
@@ -394,8 +442,9 @@ class DecisionGraphModel(GraphPredictions):
             layout, [mutex_members[mutexes[mutex_members] == q] for q in np.unique(mutexes[mutex_members])]
         )
         now, both = n_features(layout), n_features(layout) + len(layout.factor)
-        usual, synchronic, reset = (
-            from_arrays({part: state[f"{name}.{part}"] for part in SAVED}, layout, n)
-            for name, n in (("usual", now), ("late", both), ("event", now))
+        usual, reset, *late = (
+            from_arrays({part: state[f"{name}.{part}"] for part in SAVED}, layout, both if name.startswith("late") else now)
+            for name in sorted(names, key=lambda name: name.startswith("late"))
         )
-        self.fitted = Fitted(layout, usual, synchronic, reset, bool(np.any(state["has_event"])), (), ())
+        late += [no_synchronic(reset)] * (2 - len(late))
+        self.fitted = Fitted(layout, usual, late[0], reset, late[1], bool(np.any(state["has_event"])), (), ())

@@ -8,7 +8,7 @@ from mbagent.models.base import BaseTransitionModel
 from mbagent.models.dbn import sampling
 from mbagent.models.dbn.affected_variables import AffectedIndex
 from mbagent.models.dbn.arrays import Graphs
-from mbagent.models.dbn.fitting import Fitted, for_planning, no_synchronic
+from mbagent.models.dbn.fitting import Fitted, for_planning
 from mbagent.models.dbn.planes.invariants import COVERING, MOST_TRIES, Invariants, all_kept, enforced, kept_chances
 from mbagent.models.dbn.successors import WholeKernel, kernel_of, mixed, reset_draws, successors
 from mbagent.models.protocol import Successors, as_keys
@@ -89,10 +89,9 @@ class GraphPredictions(BaseTransitionModel):
         uniform = 0.5 if greedy else uniforms(derive(keys, _RESET), 1)[:, 0]
         happens = np.flatnonzero(uniform < self._reset_rates(states, actions))
         if len(happens):
-            given, reset = states[happens], fitted.reset
-            redrawn, ends = given.copy(), np.zeros(len(happens), dtype=np.bool_)
-            synchronic = no_synchronic(reset)
-            sampling.sample(given, actions[happens], keys[happens], greedy, fitted.layout, reset, synchronic, redrawn, ends)
+            given, ends = states[happens], np.zeros(len(happens), dtype=np.bool_)
+            redrawn, graphs = given.copy(), (fitted.reset, fitted.reset_synchronic)
+            sampling.sample(given, actions[happens], keys[happens], greedy, fitted.layout, *graphs, redrawn, ends)
             following[happens], over[happens] = redrawn, ends
         return following, over
 
@@ -131,7 +130,7 @@ class GraphPredictions(BaseTransitionModel):
         if not self.fitted.has_reset:
             return usual
         rate = self._reset_rates(states, actions)
-        reset = sampling.log_prob(states, actions, following, over, layout, self.fitted.reset, no_synchronic(self.fitted.reset))
+        reset = sampling.log_prob(states, actions, following, over, layout, self.fitted.reset, self.fitted.reset_synchronic)
         with np.errstate(divide="ignore"):
             return np.logaddexp(np.log1p(-rate) + usual, np.log(rate) + reset)
 
@@ -144,7 +143,7 @@ class GraphPredictions(BaseTransitionModel):
             return enforced(self._invariants, *self._cells, states, usual)
         rates: Floats = sampling.reset_rates(states, actions, planned.layout, planned.usual)
         n_resets = np.array([reset_draws(rate, n_samples) for rate in rates], dtype=np.int64)
-        parts, synchronic = [], no_synchronic(planned.reset)
+        parts = []
         for n in np.unique(n_resets):
             some = np.flatnonzero((n_resets == n) & (rates < 1.0))
             found = self._successors(
@@ -153,7 +152,7 @@ class GraphPredictions(BaseTransitionModel):
             parts.append((some, 1.0 - rates[some], found))
             if n > 0:
                 some = np.flatnonzero(n_resets == n)
-                found = self._successors(states[some], actions[some], planned.reset, synchronic, int(n), seed)
+                found = self._successors(states[some], actions[some], planned.reset, planned.reset_synchronic, int(n), seed)
                 parts.append((some, rates[some], found))
         return mixed(parts, len(states))
 

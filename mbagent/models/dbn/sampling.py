@@ -192,14 +192,7 @@ def log_prob(
     w, n_variables, result = work_space(layout, graphs, synchronic), len(layout.outputs), np.zeros(len(states), dtype=np.float64)
     other, variables = np.empty(states.shape[1], dtype=np.int64), np.arange(n_variables - 1)
     for b in range(len(states)):
-        show(states[b], actions[b], layout, w.on)
-        distributions(variables, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
-        if len(synchronic.changing):
-            show_next(following[b], layout, w.on)
-            show_next_adjacencies(following[b], layout, w.on)
-        for i in range(len(synchronic.changing)):
-            if needs_synchronic(synchronic.changing[i], actions[b], w, layout, graphs):
-                distributions(synchronic.changing[i : i + 1], states[b], actions[b], layout, synchronic, w.on, w.values, w.rates)
+        _given(states[b], actions[b], following[b], variables, layout, graphs, synchronic, w)
         other[:] = states[b]
         for variable in variables:
             if layout.mutex_of[variable] >= 0:
@@ -217,6 +210,35 @@ def log_prob(
         if not (other == following[b]).all():  # a group with no bit on, or with several
             result[b] = -math.inf
     return result
+
+
+@compiled
+def conditionals(states: Ints, actions: Ints, following: Ints, layout: Layout, graphs: Graphs, synchronic: Graphs) -> Floats:
+    """Distribution of each variable, given the next values [B, F] of those that it depends on, [B, sum of cardinalities].
+
+    That of the last variable, the reset, is left out.
+    """
+    w, variables = work_space(layout, graphs, synchronic), np.arange(len(layout.outputs) - 1)
+    result = np.zeros((len(states), graphs.start[-1]), dtype=np.float64)
+    for b in range(len(states)):
+        _given(states[b], actions[b], following[b], variables, layout, graphs, synchronic, w)
+        result[b, : graphs.start[-2]] = w.rates[: graphs.start[-2]]
+    return result
+
+
+@compiled
+def _given(
+    state: Ints, action: int, following: Ints, variables: Ints, layout: Layout, graphs: Graphs, synchronic: Graphs, w: Work
+) -> None:
+    """Writes the distributions of some variables, given the next state, to ``w.rates``."""
+    show(state, action, layout, w.on)
+    distributions(variables, state, action, layout, graphs, w.on, w.values, w.rates)
+    if len(synchronic.changing):
+        show_next(following, layout, w.on)
+        show_next_adjacencies(following, layout, w.on)
+    for i in range(len(synchronic.changing)):
+        if needs_synchronic(synchronic.changing[i], action, w, layout, graphs):
+            distributions(synchronic.changing[i : i + 1], state, action, layout, synchronic, w.on, w.values, w.rates)
 
 
 @compiled

@@ -18,7 +18,7 @@ from mbagent.models.dbn import expander as expander  # registers its overloads
 from mbagent.models.dbn.affected_variables import AffectedIndex, affected_index, only_end_is_synchronic
 from mbagent.models.dbn.arrays import Graphs, distributions, n_features, show, show_next, show_next_adjacencies, write
 from mbagent.models.dbn.features import Layout
-from mbagent.models.dbn.fitting import Fitted, no_synchronic
+from mbagent.models.dbn.fitting import Fitted
 from mbagent.models.dbn.mutex import leave_out_none, mutex_distribution, n_choices, settle
 from mbagent.models.dbn.planes.invariants import leave_out
 from mbagent.models.dbn.sampling import Work, alone, needs_synchronic, only_possible, work_space
@@ -225,9 +225,7 @@ class WholeKernel(NamedTuple):
     """Decision graphs for compiled search, for models with resets or synchronic arcs.
 
     Attributes:
-        layout, usual, synchronic, reset: see ``fitting.Fitted``; for planning.
-        reset_synchronic: graphs of no variable, since resets have no synchronic arcs.
-        has_reset: whether there are resets.
+        layout, usual, synchronic, reset, reset_synchronic, has_reset: see ``fitting.Fitted``; for planning.
     """
 
     layout: Layout
@@ -242,8 +240,8 @@ def kernel_of(fitted: Fitted, cardinalities: tuple[int, ...]) -> AffectedIndex |
     """The kernel of fitted graphs for planning: an ``AffectedIndex`` if possible, else a ``WholeKernel``."""
     if not fitted.has_reset and only_end_is_synchronic(fitted.layout, fitted.synchronic):
         return affected_index(fitted.layout, fitted.usual, fitted.synchronic, cardinalities)
-    none = no_synchronic(fitted.reset)
-    return WholeKernel(fitted.layout, fitted.usual, fitted.synchronic, fitted.reset, none, bool(fitted.has_reset))
+    f = fitted
+    return WholeKernel(f.layout, f.usual, f.synchronic, f.reset, f.reset_synchronic, bool(f.has_reset))
 
 
 class WholeWork(NamedTuple):

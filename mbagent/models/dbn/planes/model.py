@@ -20,7 +20,7 @@ from mbagent.models.dbn import sampling
 from mbagent.models.dbn.arrays import Graphs, build
 from mbagent.models.dbn.change_points import last_changes
 from mbagent.models.dbn.features import Layout, Observed, Question, ask, distinct
-from mbagent.models.dbn.fitting import UNCERTAIN, Fitted, fit_graphs, go_together, no_synchronic, uncertain_rows
+from mbagent.models.dbn.fitting import UNCERTAIN, Fitted, all_redrawn, fit_graphs, go_together, no_synchronic, uncertain_rows
 from mbagent.models.dbn.model import IMPOSSIBLE_LOG_PROB, DecisionGraphModel, depends_on_action, tested_features
 from mbagent.models.dbn.planes.features import (
     NEXT,
@@ -252,7 +252,7 @@ class LocalGraphModel(DecisionGraphModel):
 
     def _instantiate(self, questions: tuple[Question, ...], found: tuple[Search, ...]) -> None:
         layout, graphs, synchronic = instantiate(self.local, self.board)
-        self.fitted = Fitted(layout, graphs, synchronic, graphs, False, questions, found)
+        self.fitted = Fitted(layout, graphs, synchronic, graphs, no_synchronic(graphs), False, questions, found)
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
         """See TransitionModel."""
@@ -528,7 +528,14 @@ class PlaneGraphModel(LocalGraphModel):
         ):
             return False
         flat = DecisionGraphModel(self.cardinalities, self.n_actions, parts=self.parts)
-        flat.fitted = fit_graphs(self.cardinalities, self.encoding, some, np.zeros(len(some), dtype=np.bool_), False, False)
+        flat.fitted = fit_graphs(
+            self.cardinalities,
+            self.encoding,
+            some,
+            all_redrawn(np.zeros(len(some), dtype=np.bool_), len(self.cardinalities)),
+            False,
+            False,
+        )
         logs = flat.log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
         return better(np.maximum(logs, IMPOSSIBLE_LOG_PROB), np.full(len(logs), -loss))
 
