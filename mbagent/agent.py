@@ -38,9 +38,8 @@ from mbagent.environments import EnvironmentAlgorithm, step
 from mbagent.explain import Explanation, explain
 from mbagent.exploration.strategies import EXPLORATIONS, Exploration, Watching, catch_up
 from mbagent.files import Target
-from mbagent.models.base import FitReport
 from mbagent.models.neural.connections import PruningConfig, check_fraction, prunable
-from mbagent.models.protocol import TransitionModel
+from mbagent.models.protocol import FitReport, TransitionModel
 from mbagent.models.registry import build_model
 from mbagent.models.reward import LearnedReward
 from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy

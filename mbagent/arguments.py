@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -44,11 +45,24 @@ def planner_settings(own: Mapping[str, Any], policy_kwargs: Mapping[str, Any], s
     """
     if not isinstance(policy_kwargs, Mapping):
         raise TypeError(f"policy_kwargs must be a dict of planner settings, got {policy_kwargs!r}.")
+    policy_kwargs = _present(policy_kwargs)
     known = sorted(set(PlannerSettings.__dataclass_fields__) - {*own, "seed"})
     unknown = sorted(set(policy_kwargs) - set(known))
     if unknown:
         raise TypeError(f"policy_kwargs has no {unknown[0]!r}; it takes {', '.join(known)}.")
     return PlannerSettings(**own, seed=seed, **policy_kwargs)
+
+
+def _present(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with present names and values; those of the version before work for one more version."""
+    given = dict(policy_kwargs)
+    if "wave" in given:
+        warnings.warn("policy_kwargs: 'wave' is now called 'batch_size'.", DeprecationWarning, stacklevel=4)
+        given.setdefault("batch_size", given.pop("wave"))
+    if given.get("leaf_values") == "machine":
+        warnings.warn("policy_kwargs: leaf_values='machine' is now called 'lookahead'.", DeprecationWarning, stacklevel=4)
+        given["leaf_values"] = "lookahead"
+    return given
 
 
 def check_seed(seed: Any) -> int | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -87,7 +88,7 @@ class Explanation:
             numbers, this is more informative about the choice than overlapping errors.
         visits: float64 [A], simulations through each action; all 0 if there were none, as with the ValueIterationPolicy, or
             if the whole MDP is solved.
-        machine_states: number of states of the reachable MDP if it was solved completely; 0 if it is too large.
+        mdp_states: number of states of the reachable MDP if it was solved completely; 0 if it is too large.
         futures: for each action its most probable simulated futures, in decreasing order. After the action they follow the
             planner's best policy (with flat Monte Carlo, which has none, they are one step long).
         rare: for each action the outcomes less probable than ``RARE_VALUE`` that contribute to its value, in decreasing order
@@ -104,10 +105,16 @@ class Explanation:
     errors: Floats
     chosen: Floats
     visits: Floats
-    machine_states: int
+    mdp_states: int
     futures: tuple[tuple[Future, ...], ...]
     rare: tuple[tuple[Step, ...], ...]
     effects: tuple[tuple[float, ...], ...]
+
+    @property
+    def machine_states(self) -> int:
+        """Deprecated name of ``mdp_states``."""
+        warnings.warn("Explanation.machine_states is now mdp_states.", DeprecationWarning, stacklevel=2)
+        return self.mdp_states
 
     def table(self, n_actions: int = 5) -> str:
         """The best actions and their futures, as text.
@@ -133,8 +140,8 @@ class Explanation:
         return "\n".join(lines)
 
     def _headline(self) -> str:
-        if self.machine_states:
-            return f"The reachable MDP of {self.machine_states:,} states is solved completely; no search was needed."
+        if self.mdp_states:
+            return f"The reachable MDP of {self.mdp_states:,} states is solved completely; no search was needed."
         return f"{self.visits.sum():.0f} simulations." if self.visits.any() else "Values of a lookahead around the state."
 
 
@@ -153,7 +160,7 @@ def _explanation(policy: PlannerPolicy, observation: Any, n_futures: int, n_step
     settings = replace(policy.settings, time_budget=None, reuse_tree=False)
     planner = _planner(policy, settings, policy.planner)
     found = _trace(planner, state)
-    others = _other_values(policy, settings if found.machine_states else replace(settings, max_states=1), state, planner)
+    others = _other_values(policy, settings if found.mdp_states else replace(settings, max_states=1), state, planner)
     values = np.concatenate([found.plan.values, *(plan_values for plan_values, _ in others)])
     taken = [int(found.plan.actions[0]), *(action for _, action in others)]
     return Explanation(
@@ -164,7 +171,7 @@ def _explanation(policy: PlannerPolicy, observation: Any, n_futures: int, n_step
         errors=(values - values[0]).std(axis=0, ddof=1),  # exactly 0 if all are equal
         chosen=np.bincount(taken, minlength=policy.actions.n) / len(taken),
         visits=found.plan.visits[0],
-        machine_states=found.machine_states,
+        mdp_states=found.mdp_states,
         futures=_futures(policy, found, n_futures, n_steps),
         **_rare(policy, found, n_futures),
     )

@@ -39,7 +39,7 @@ def flier_catcher(policy: str) -> ModelLearningAgent:
 def test_a_solved_mdp_is_explained_by_its_exact_values(policy: str) -> None:
     why = agent_for(policy).explain(np.array(2))
     np.testing.assert_allclose(why.values, optimal_q(TABLE, REWARDS, 0.9)[2], atol=1e-4)
-    assert why.machine_states == 5
+    assert why.mdp_states == 5
     assert why.visits.tolist() == why.errors.tolist() == [0.0, 0.0]  # neither simulations nor samples are used
     assert why.chosen[why.best] == 1.0
     assert "5 states" in why.table()
@@ -108,7 +108,7 @@ def test_simulated_futures_can_be_drawn_by_the_game(policy: str) -> None:
     agent = flier_catcher(policy)
     game, obs = FlierCatcher(), gym.make("mbagent/FlierCatcher-v0").reset(seed=2)[0]
     why = agent.explain(obs)
-    assert why.machine_states == 0
+    assert why.mdp_states == 0
     np.testing.assert_array_equal(why.observation, obs)
     pictures = [draw_ansi(game.scene(step.observation)) for future in why.futures[why.best] for step in future.steps]
     assert all("@" in picture for picture in pictures)

@@ -3,7 +3,7 @@
 import ast
 import statistics
 import tokenize
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +14,7 @@ SOURCES = sorted(p for folder in ("mbagent", "envs", "scripts", "tests") for p i
 MAX_FILE_LINES = 600
 MAX_FUNCTION_LINES = 60
 MEDIAN_FUNCTION_LINES = 10
+MOST_LIBRARY_FILES, MOST_FILES_IN_A_FOLDER = 90, 20
 LIBRARY = [p for p in SOURCES if p.relative_to(ROOT).parts[0] == "mbagent"]
 FORMER_NAMES = {
     *(
@@ -176,3 +177,9 @@ def test_functions_are_short_in_the_median() -> None:
         if isinstance(node, ast.FunctionDef)
     ]
     assert statistics.median(lengths) <= MEDIAN_FUNCTION_LINES
+
+
+def test_the_library_has_few_files() -> None:
+    assert len(LIBRARY) <= MOST_LIBRARY_FILES
+    folders = Counter(path.parent for path in LIBRARY)
+    assert {str(folder): n for folder, n in folders.items() if n > MOST_FILES_IN_A_FOLDER} == {}

@@ -9,8 +9,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mbagent.data import TransitionDataset
-from mbagent.models.base import BaseTransitionModel, FitReport
-from mbagent.models.protocol import Successors, as_keys
+from mbagent.models.base import BaseTransitionModel
+from mbagent.models.protocol import FitReport, Successors, as_keys
 from mbagent.planning.planner import Planner
 from mbagent.types import Floats, Ints, Randomness
 from mbagent_envs.random_keys import uniforms

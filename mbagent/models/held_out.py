@@ -1,11 +1,18 @@
-"""Comparison of candidate models on held-out transitions; evenly spaced subsets suffice for quick decisions."""
+"""Comparison of candidate models on held-out transitions, for which evenly spaced subsets suffice, and the Markov test.
+
+The test asks whether the previous step improves predictions given the current state and action. If it does, the observation is
+not the whole state, and ``mbagent.wrappers.History`` adds the past to it.
+"""
 
 from __future__ import annotations
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mbagent.data import TransitionBatch, TransitionDataset
+from mbagent.models.dbn.features import ActionEncoding, action_feature_table
+from mbagent.spaces import FactoredSpace, PlaneLayout
 
 SOME_ROWS, SOME_TESTS = 2500, 1000
 """Maximum numbers of transitions for fits and for held-out tests in quick decisions between candidates."""
@@ -33,3 +40,72 @@ def within(data: TransitionDataset, most: int) -> TransitionDataset:
     smaller = TransitionDataset(data.cardinalities, data.n_actions)
     smaller.append(thinned(data.rows(), n))
     return smaller
+
+
+PART = 2000
+"""Number of transitions that are compared at once."""
+
+
+def following_steps(rows: TransitionBatch) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices of the transitions that follow another one in the same episode, and of their predecessors.
+
+    Episodes may be interleaved.
+    """
+    order = np.argsort(rows.episodes, kind="stable")
+    earlier, later = order[:-1], order[1:]
+    same = (rows.episodes[later] == rows.episodes[earlier]) & _follow(rows, later, earlier)
+    return later[same], earlier[same]
+
+
+def _follow(rows: TransitionBatch, later: NDArray[np.int64], earlier: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which of the later transitions begin in the state where the earlier ones end; compared in parts to limit memory."""
+    found = np.zeros(len(later), dtype=np.bool_)
+    for begin in range(0, len(later), PART):
+        part = slice(begin, begin + PART)
+        found[part] = (rows.before[later[part]] == rows.after[earlier[part]]).all(axis=1)
+    return found
+
+
+def steps_in_a_row(rows: TransitionBatch, most: int) -> tuple[TransitionBatch, TransitionBatch]:
+    """At most ``most`` evenly spaced transitions that follow another one, and their predecessors."""
+    later, earlier = following_steps(rows)
+    some = np.linspace(0, len(later) - 1, min(len(later), most)).astype(np.int64) if len(later) else later
+    return rows.select(later[some]), rows.select(earlier[some])
+
+
+def with_past(
+    now: TransitionBatch,
+    before: TransitionBatch,
+    cardinalities: tuple[int, ...],
+    encoding: ActionEncoding,
+    board: PlaneLayout | None,
+) -> tuple[FactoredSpace, TransitionBatch]:
+    """Transitions whose states include the state and action of their predecessors.
+
+    Args:
+        now: the transitions.
+        before: their predecessors.
+        cardinalities: number of values of each factor.
+        encoding: of the actions.
+        board: layout of the factors if they form planes, so that the past is added as further planes; else None.
+
+    Returns:
+        (the space of states with a past, the transitions).
+    """
+    shape: tuple[int, ...] = (len(cardinalities),) if board is None else (board.channels, board.height, board.width)
+
+    def arranged(states: NDArray[np.int64]) -> NDArray[np.int64]:
+        return states if board is None else board.to_planes(states)
+
+    def with_history(states: NDArray[np.int64], past: NDArray[np.int64], actions: NDArray[np.int64]) -> NDArray[np.int64]:
+        bits = action_feature_table(encoding, actions).astype(np.int64)
+        bits = bits if board is None else np.broadcast_to(bits[:, :, None, None], (*bits.shape, *shape[1:]))
+        return np.concatenate([arranged(states), arranged(past), bits], axis=1)
+
+    cards = arranged(np.asarray(cardinalities)[None])[0]
+    twos = np.full((encoding.n_features, *shape[1:]), 2)
+    sizes = np.concatenate([cards, cards, twos])
+    space = FactoredSpace(spaces.MultiBinary(sizes.shape) if (sizes == 2).all() else spaces.MultiDiscrete(sizes))
+    states = space.encode(with_history(now.states, before.states, before.actions))
+    following = space.encode(with_history(now.next_states, now.states, now.actions))
+    return space, TransitionBatch(states, now.actions, following, now.terminated, now.rewards, now.episodes)

@@ -127,7 +127,7 @@ HELD_OUT = 0.15
 
 _CHUNK = 256
 
-CLEARLY = 3.0
+CLEARLY_BETTER = 3.0
 """Difference of held-out log-likelihoods, in nats, from which graphs or a network are clearly better."""
 
 FEWEST_MISSED = 4
@@ -246,10 +246,10 @@ class LearnedReward:
             held = np.isin(rows.episodes, chosen)
             if held.any():
                 held_out, gain = self._choose(rows, held)
-                if abs(gain) <= CLEARLY:  # rare rewards may be missing in the test rows
+                if abs(gain) <= CLEARLY_BETTER:  # rare rewards may be missing in the test rows
                     missed = self._half_of_missed(rows)
                     gain = self._choose(rows, missed)[1] if missed.any() else gain
-                clearly = gain > CLEARLY
+                clearly = gain > CLEARLY_BETTER
             if self._graphs is not None or not held.any():
                 self._graphs = self._as_graphs(rows)
             trained = held.any() and self._graphs is None
@@ -287,8 +287,8 @@ class LearnedReward:
         self._train_on(train)
         gain, fewer_misses = logs - self._log_likelihood(tests), missed <= self._missed(train).sum()
         # Test rows hardly distinguish means of random rewards, and those of graphs are the means of the training rows.
-        least = -CLEARLY if _contrary_share(train) > 0.0 else 0.0
-        if gain > CLEARLY or (gain >= least and fewer_misses):
+        least = -CLEARLY_BETTER if _contrary_share(train) > 0.0 else 0.0
+        if gain > CLEARLY_BETTER or (gain >= least and fewer_misses):
             self._graphs = graphs
             return right, gain
         return self._share_right(tests), gain

@@ -16,8 +16,7 @@ from scipy.sparse import csr_array
 
 from mbagent.models.mdp import GraphArrays, StateGraph
 from mbagent.models.protocol import TransitionModel
-from mbagent.planning.value_function import LOWEST_KNOWN, LeafValues, evaluate, sum_of
-from mbagent.planning.value_iteration import bellman, score_edges
+from mbagent.planning.value_iteration import LOWEST_KNOWN, LeafValues, bellman, evaluate, score_edges, sum_of
 from mbagent.types import Actions, Floats, Ints, Reward, States
 from mbagent_envs.jit import compiled
 from mbagent_envs.random_keys import derive

@@ -118,7 +118,7 @@ class FlatMonteCarlo:
     def plan(self, roots: States) -> Plan:
         """See Planner. Every action gets the same number of simulations.
 
-        With a time budget, rounds of ``wave`` simulations run until the next one would exceed it.
+        With a time budget, rounds of ``batch_size`` simulations run until the next one would exceed it.
         """
         if self._model is None or self._goal is None:
             raise RuntimeError("The planner has no model or no goal yet; call set_model and set_goal first.")
@@ -141,7 +141,7 @@ class FlatMonteCarlo:
         assert model is not None
         assert goal is not None  # ``plan`` has checked both
         n_actions = model.n_actions
-        each = max(1, (settings.num_simulations if settings.time_budget is None else settings.wave) // n_actions)
+        each = max(1, (settings.num_simulations if settings.time_budget is None else settings.batch_size) // n_actions)
         rows = np.repeat(np.arange(len(roots)), n_actions * each)
         actions = np.tile(np.repeat(np.arange(n_actions), each), len(roots))
         # Common random numbers: simulation k uses the same ones for every action.

@@ -31,13 +31,13 @@ class PlannerSettings:
         learn_values: whether leaf values are learned in simulations, once for each goal, if the reachable MDP is too large. They
             are the values of unexpanded states of the lookahead. If that performs better in simulations, searches do not use
             them, or use them directly after a first step with ``n_samples`` samples, without a larger lookahead.
-        leaf_values: "machine" (values of the reachable MDP or lookahead) or "rollouts" (random play).
+        leaf_values: "lookahead" (values of the reachable MDP, or of a lookahead around the root) or "rollouts" (random play).
         backup: "max" (the value of an action is that of the best policy after it) or "mean" (plain UCT).
         choice: "mean", or "greatest" as in the paper (flat Monte Carlo only; risk-seeking).
         forecasts: "iterated" (simulations go step by step) or "direct" (flat Monte Carlo only: each step is forecast from
             the root by a model of its own, paper 4.2; needs ``model="direct"`` or another DirectForecastModel).
         c_uct: weight of the search's exploration, in units of the range of values.
-        wave: simulations between two calls of the model: the size of a batch of simulations.
+        batch_size: simulations between two calls of the model.
         prior_visits: number of visits that an initial value counts as in the search.
         reuse_tree: whether a decision starts from the search of the last one (MctsPolicy, one observation at a time). That is
             dropped at episode starts (see ``predict(..., episode_start=...)``), with a new goal or new weights, if it has more
@@ -59,12 +59,12 @@ class PlannerSettings:
     n_samples: int = 16
     lookahead_samples: int = 4
     learn_values: bool = True
-    leaf_values: Literal["machine", "rollouts"] = "machine"
+    leaf_values: Literal["lookahead", "rollouts"] = "lookahead"
     backup: Literal["max", "mean"] = "max"
     choice: Literal["mean", "greatest"] = "mean"
     forecasts: Literal["iterated", "direct"] = "iterated"
     c_uct: float = 0.5
-    wave: int = 16
+    batch_size: int = 16
     prior_visits: float = 8.0
     reuse_tree: bool = False
     seed: int = 0
@@ -78,7 +78,7 @@ class PlannerSettings:
             "lookahead_states",
             "n_samples",
             "lookahead_samples",
-            "wave",
+            "batch_size",
         ):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
@@ -107,7 +107,7 @@ class PlannerSettings:
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} must be True or False, got {getattr(self, name)!r}.")
         choices = {
-            "leaf_values": ("machine", "rollouts"),
+            "leaf_values": ("lookahead", "rollouts"),
             "backup": ("max", "mean"),
             "choice": ("mean", "greatest"),
             "forecasts": ("iterated", "direct"),

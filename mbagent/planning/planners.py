@@ -24,8 +24,17 @@ from mbagent.planning.planner import Plan, PlannerSettings, best_actions
 from mbagent.planning.racing import LookaheadConfig, best_config
 from mbagent.planning.search import MAX_KEPT, Paths, Rules, Tables, begin_batch, carry_over, empty_paths, end_batch, measure_spans
 from mbagent.planning.trajectories import PlanTrace, best_policy
-from mbagent.planning.value_function import LOWEST_KNOWN
-from mbagent.planning.value_iteration import SolvedMdp, Values, break_ties, doubt, score_edges, settle, solve, undecided
+from mbagent.planning.value_iteration import (
+    LOWEST_KNOWN,
+    SolvedMdp,
+    Values,
+    break_ties,
+    doubt,
+    score_edges,
+    settle,
+    solve,
+    undecided,
+)
 from mbagent.types import Actions, Floats, Ints, Reward, States
 from mbagent_envs.random_keys import derive
 
@@ -132,11 +141,11 @@ class ValueIterationPlanner:
         zeros = np.zeros((1, graph.model.n_actions))
         return self._trace_of(Expanded(graph, nodes, solution, zeros, scores), int(graph.expanded.sum()))
 
-    def _trace_of(self, found: Expanded, machine_states: int) -> PlanTrace:
+    def _trace_of(self, found: Expanded, mdp_states: int) -> PlanTrace:
         plan = Plan(best_actions(found.scores), found.solution.q[found.nodes], found.visits)
         policy = best_policy(found.graph, found.solution.q, self.settings.gamma, found.tried)
         solution = found.solution
-        return PlanTrace(plan, found.graph, int(found.nodes[0]), solution.rewards, policy, solution.v, machine_states)
+        return PlanTrace(plan, found.graph, int(found.nodes[0]), solution.rewards, policy, solution.v, mdp_states)
 
     def _expand(self, roots: States) -> Expanded:
         """Expands and solves a lookahead around each root [R, F]; no search follows."""
@@ -223,7 +232,7 @@ _SEARCH_SALT, _REUSE_SALT = 0x5EA6C4, 0xCA1212
 class MctsPlanner(ValueIterationPlanner):
     """UCT on a state graph.
 
-    With ``leaf_values="machine"`` the search starts from the values of a lookahead around the root, each of which counts as
+    With ``leaf_values="lookahead"`` the search starts from the values of a lookahead around the root, each of which counts as
     ``prior_visits`` visits, and expands promising states further; if the reachable MDP is solved, there is no search.
     With ``leaf_values="rollouts"`` it starts without values and evaluates leaves by random play, as textbook UCT does.
     """
@@ -254,14 +263,14 @@ class MctsPlanner(ValueIterationPlanner):
         """See Planner."""
         if len(roots) > 1:
             self._last = None
-        if self.settings.leaf_values == "machine":
+        if self.settings.leaf_values == "lookahead":
             return super().plan(roots)
         found = self._expand(roots)
         return Plan(best_actions(found.scores), found.solution.q[found.nodes], found.visits)
 
     def trace(self, root: States) -> PlanTrace:
         """See ValueIterationPlanner."""
-        return super().trace(root) if self.settings.leaf_values == "machine" else self._trace_of(self._expand(root), 0)
+        return super().trace(root) if self.settings.leaf_values == "lookahead" else self._trace_of(self._expand(root), 0)
 
     def _expand(self, roots: States) -> Expanded:
         """Searches from each root [R, F]."""
@@ -269,7 +278,7 @@ class MctsPlanner(ValueIterationPlanner):
         deadline = None if settings.time_budget is None else time.perf_counter() + len(roots) * settings.time_budget
         search = self._reused_search(roots) if settings.reuse_tree else None
         if search is None:
-            begin = self._lookahead if settings.leaf_values == "machine" else self._expanded_roots
+            begin = self._lookahead if settings.leaf_values == "lookahead" else self._expanded_roots
             graph, solution, nodes = begin(roots)
             search = _Search(self, graph, _first_tables(solution, nodes), nodes)
         found = search.run(deadline)
@@ -287,7 +296,7 @@ class MctsPlanner(ValueIterationPlanner):
             return None
         graph = self._spare = self._spare if self._spare is not None else StateGraph(self._known_model())
         tables = carry_over(last.graph, last.tables, root, graph)
-        if self.settings.leaf_values == "machine" and 2 * graph.expanded.sum() < self._chosen_config().states:
+        if self.settings.leaf_values == "lookahead" and 2 * graph.expanded.sum() < self._chosen_config().states:
             return None
         self._expanded, self._spare = graph, last.graph
         return _Search(self, graph, tables, np.zeros(1, dtype=np.int64), last.decision + 1)
@@ -321,7 +330,7 @@ class _Search:
         if deadline is not None:
             return self._run_until(deadline)
         settings, done = self.settings, 0
-        size = min(settings.wave, settings.num_simulations)
+        size = min(settings.batch_size, settings.num_simulations)
         paths, leaves = (
             empty_paths(len(self.roots), size, settings.horizon),
             np.empty(2 * len(self.roots) * size, dtype=np.int64),
@@ -336,7 +345,7 @@ class _Search:
 
     def _run_until(self, deadline: float) -> Expanded:
         """Runs at least one batch; further ones if they and the final value iteration should end before the deadline."""
-        size, done, now = self.settings.wave, 0, time.perf_counter()
+        size, done, now = self.settings.batch_size, 0, time.perf_counter()
         paths = empty_paths(len(self.roots), size, self.settings.horizon)
         leaves = np.empty(2 * len(self.roots) * size, dtype=np.int64)
         last = 0.0

@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from mbagent.planning.fitted_value_iteration import Task
-from mbagent.planning.value_function import LeafValues
+from mbagent.planning.value_iteration import LeafValues
 from mbagent.types import Actions, Floats, States
 from mbagent_envs.random_keys import derive
 

@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mbagent.models.mdp import GraphArrays, StateGraph, add_edge, add_node
-from mbagent.planning.value_function import LeafValues, leaf_value
-from mbagent.planning.value_iteration import TOLERANCE, bellman, sweep
+from mbagent.planning.value_iteration import TOLERANCE, LeafValues, bellman, leaf_value, sweep
 from mbagent.types import Floats, Ints
 from mbagent_envs.jit import compiled
 from mbagent_envs.random_keys import uniform_at
@@ -35,9 +34,9 @@ class Paths(NamedTuple):
     ends: Ints
 
 
-def empty_paths(n_roots: int, wave: int, horizon: int) -> Paths:
+def empty_paths(n_roots: int, batch_size: int, horizon: int) -> Paths:
     """Arrays for the paths of one batch."""
-    shape = (n_roots, wave)
+    shape = (n_roots, batch_size)
     ints = np.zeros((*shape, horizon), dtype=np.int64)
     return Paths(ints, np.zeros(shape, np.int64), np.full(shape, -1, np.int64), np.full(shape, -1, np.int64))
 

@@ -29,7 +29,7 @@ class PlanTrace:
         rewards: float64 [M], of the graph's successor edges.
         policy: int64 [N], the action of the best policy found in each node; -1 for nodes without successors.
         values: float64 [N], of the graph's states; None with flat Monte Carlo.
-        machine_states: number of states if the reachable MDP was solved, so that there was no search; else 0.
+        mdp_states: number of states if the reachable MDP was solved, so that there was no search; else 0.
     """
 
     plan: Plan
@@ -38,7 +38,7 @@ class PlanTrace:
     rewards: Floats
     policy: Ints
     values: Floats | None = None
-    machine_states: int = 0
+    mdp_states: int = 0
 
 
 @runtime_checkable

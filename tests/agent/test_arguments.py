@@ -255,3 +255,14 @@ def test_a_folder_of_the_same_name_does_not_hide_the_file(runner: ModelLearningA
     assert ModelLearningAgent.load(tmp_path / "agent", env=gym.make(GEYSER)).policy.fitted
     with pytest.raises(TypeError, match="from a path or an open binary file"):
         ModelLearningAgent.load(None)  # type: ignore[arg-type]
+
+
+def test_settings_with_names_of_the_version_before_work_with_a_warning() -> None:
+    old = {"wave": 4, "leaf_values": "machine"}
+    with pytest.warns(DeprecationWarning, match="is now called") as warned:
+        agent = ModelLearningAgent("MctsPolicy", gym.make(GEYSER), seed=0, policy_kwargs=old)
+    assert (agent.policy.settings.batch_size, agent.policy.settings.leaf_values) == (4, "lookahead")
+    assert [str(w.message) for w in warned] == [
+        "policy_kwargs: 'wave' is now called 'batch_size'.",
+        "policy_kwargs: leaf_values='machine' is now called 'lookahead'.",
+    ]

@@ -13,12 +13,13 @@ from mbagent import ModelLearningAgent
 from mbagent.exploration.strategies import (
     EXPLORATIONS,
     MANY_STATES,
+    START_NODE,
     DirectedExploration,
     Exploration,
     RandomExploration,
+    VisitTable,
     Watching,
 )
-from mbagent.exploration.visit_counts import START_NODE, VisitTable
 from mbagent.types import Ints
 
 pytestmark = pytest.mark.filterwarnings("ignore:The environment has no reward_fn")

@@ -5,7 +5,7 @@ from mbagent.models.base import ExactModel
 from mbagent.models.neural.sampling import independent_successors
 from mbagent.models.protocol import Successors, as_keys
 from mbagent.planning.fitted_value_iteration import Task, greedy_actions, learn_values
-from mbagent.planning.value_function import evaluate
+from mbagent.planning.value_iteration import evaluate
 from mbagent.types import Bools, Floats, Randomness, States
 from mbagent_envs.random_keys import uniforms
 

@@ -10,7 +10,7 @@ ROLLOUTS = PlannerSettings(leaf_values="rollouts", backup="mean", num_simulation
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("settings", [PlannerSettings(gamma=0.8), ROLLOUTS], ids=["machine", "rollouts"])
+@pytest.mark.parametrize("settings", [PlannerSettings(gamma=0.8), ROLLOUTS], ids=["lookahead", "rollouts"])
 def test_search_finds_the_best_action_of_a_stochastic_world(seed: int, settings: PlannerSettings) -> None:
     table, rewards = random_table(8, 3, seed), np.random.default_rng(seed).normal(size=8)
     exact = optimal_q(table, rewards, 0.8)
@@ -23,7 +23,7 @@ def test_search_finds_the_best_action_of_a_stochastic_world(seed: int, settings:
 def test_search_repairs_a_lookahead_too_short_to_see_the_prize(seed: int) -> None:
     # A corridor: the prize is 9 steps to the right, the lookahead has 4 states; the search must expand it.
     table, rewards = prize_corridor()
-    short = PlannerSettings(max_states=1, lookahead_states=4, num_simulations=600, wave=4, learn_values=False, seed=seed)
+    short = PlannerSettings(max_states=1, lookahead_states=4, num_simulations=600, batch_size=4, learn_values=False, seed=seed)
     greedy = planner_for(ValueIterationPlanner(short), table, rewards).plan(np.array([[0]]))
     assert greedy.values[0, 0] == greedy.values[0, 1]
     plan = planner_for(MctsPlanner(short), table, rewards).plan(np.array([[0]]))
@@ -46,7 +46,9 @@ def test_several_successors_are_kept_for_an_action() -> None:
         assert plan.values[0, 0] == pytest.approx(0.2, abs=0.15)
 
 
-@pytest.mark.parametrize("settings", [PlannerSettings(max_states=1, lookahead_states=10), ROLLOUTS], ids=["machine", "rollouts"])
+@pytest.mark.parametrize(
+    "settings", [PlannerSettings(max_states=1, lookahead_states=10), ROLLOUTS], ids=["lookahead", "rollouts"]
+)
 def test_a_plan_does_not_depend_on_the_batch(settings: PlannerSettings) -> None:
     table, rewards = random_table(25, 3, 9), np.random.default_rng(9).normal(size=25)
     planner = planner_for(MctsPlanner(settings), table, rewards)

@@ -5,7 +5,7 @@ import pytest
 
 from mbagent.planning import fitted_value_iteration
 from mbagent.planning.fitted_value_iteration import PAIRED, RIDGE, PairRegression
-from mbagent.planning.value_function import leaf_value
+from mbagent.planning.value_iteration import leaf_value
 
 CARDINALITIES = (2, 3, 5, 2)
 

@@ -7,7 +7,7 @@ from mbagent.planning.fitted_value_iteration import Task
 from mbagent.planning.planner import PlannerSettings
 from mbagent.planning.planners import MctsPlanner, ValueIterationPlanner
 from mbagent.planning.racing import BLOCK_STEPS, MOST_BLOCKS, LookaheadConfig, _Trial, best_config
-from mbagent.planning.value_function import LOWEST_KNOWN
+from mbagent.planning.value_iteration import LOWEST_KNOWN
 from mbagent.types import Actions, Bools, Floats, Randomness, States
 from tests.planning.test_fitted_value_iteration import Bulbs, count_bits
 
@@ -67,7 +67,7 @@ def test_no_rewards_follow_the_end_of_an_episode() -> None:
 
 
 def settings(**changes: object) -> PlannerSettings:
-    return PlannerSettings(gamma=0.9, max_states=10, lookahead_states=4, num_simulations=4, wave=4, **changes)  # type: ignore[arg-type]
+    return PlannerSettings(gamma=0.9, max_states=10, lookahead_states=4, num_simulations=4, batch_size=4, **changes)  # type: ignore[arg-type]
 
 
 def planner(kind: type[ValueIterationPlanner] = MctsPlanner, **changes: object) -> ValueIterationPlanner:

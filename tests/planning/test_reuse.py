@@ -9,7 +9,7 @@ from mbagent.planning.search import carry_over
 from tests.worlds import TableWorld, arrival_goal, optimal_q, random_table
 
 KINDS = {
-    "machine": PlannerSettings(max_states=1, lookahead_states=8, gamma=0.8, reuse_tree=True),
+    "lookahead": PlannerSettings(max_states=1, lookahead_states=8, gamma=0.8, reuse_tree=True),
     "rollouts": PlannerSettings(
         leaf_values="rollouts", backup="mean", num_simulations=400, horizon=8, gamma=0.8, c_uct=0.7, reuse_tree=True
     ),
@@ -87,14 +87,14 @@ def test_new_goals_models_episodes_and_batches_drop_the_tree(kind: str) -> None:
 
 
 def test_a_tree_grown_too_large_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = planner(KINDS["machine"])
+    made = planner(KINDS["lookahead"])
     made.plan(np.array([[0]]))
     monkeypatch.setattr(planners, "MAX_KEPT", 5)
     assert not is_reused(made, 0)
 
 
 def test_a_goal_that_fails_leaves_no_incomplete_tree() -> None:
-    made = planner(KINDS["machine"])
+    made = planner(KINDS["lookahead"])
     made.set_model(TableWorld(random_table(3000, 2, 5)), np.array([[0]]))
     made.set_goal(lambda states, actions, following: np.zeros(len(actions)))
     made.plan(np.array([[0]]))

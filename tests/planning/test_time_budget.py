@@ -39,7 +39,7 @@ def test_more_time_gives_more_simulations_and_every_decision_has_a_batch(
     planner_class: type[Planner], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def of(budget: float, n_roots: int = 1) -> float:
-        settings = PlannerSettings(max_states=1, lookahead_states=3, wave=4, time_budget=budget, num_simulations=1)
+        settings = PlannerSettings(max_states=1, lookahead_states=3, batch_size=4, time_budget=budget, num_simulations=1)
         return simulations(planner_class(settings), n_roots, monkeypatch)
 
     assert of(1e-9) == 4
@@ -48,13 +48,13 @@ def test_more_time_gives_more_simulations_and_every_decision_has_a_batch(
 
 
 def test_rollouts_respect_the_time_budget_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = PlannerSettings(leaf_values="rollouts", backup="mean", wave=4, time_budget=20.0)
+    settings = PlannerSettings(leaf_values="rollouts", backup="mean", batch_size=4, time_budget=20.0)
     assert simulations(MctsPlanner(settings), 1, monkeypatch) > 8
 
 
 def test_a_search_ends_at_its_maximum_size(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planners, "MAX_SEARCHED", 1)
-    settings = PlannerSettings(max_states=1, lookahead_states=3, wave=4, time_budget=1e6)
+    settings = PlannerSettings(max_states=1, lookahead_states=3, batch_size=4, time_budget=1e6)
     assert simulations(MctsPlanner(settings), 1, monkeypatch) == 4
 
 

@@ -69,4 +69,4 @@ def test_the_trace_has_the_same_plan(kind: str) -> None:
     np.testing.assert_array_equal(found.plan.values, plan.values)
     np.testing.assert_array_equal(found.plan.visits, plan.visits)
     assert found.plan.actions.tolist() == plan.actions.tolist()
-    assert (found.machine_states == 9) == (kind == "solved")
+    assert (found.mdp_states == 9) == (kind == "solved")

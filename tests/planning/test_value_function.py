@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mbagent.planning.value_function import LOWEST_KNOWN, LeafValues, evaluate, leaf_value
+from mbagent.planning.value_iteration import LOWEST_KNOWN, LeafValues, evaluate, leaf_value
 
 PAIRS = np.array([[0.0, 5.0, 0.0], [5.0, 0.0, 0.25], [0.0, 0.25, 0.0]])
 """Features: the first factor is 1; the second is 0; the second is 2. (Value 3 of the second was never observed.)"""

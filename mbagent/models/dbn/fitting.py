@@ -35,8 +35,8 @@ from mbagent.models.dbn.features import (
     variable_values,
 )
 from mbagent.models.dbn.mutex import find_cliques, find_groups
+from mbagent.models.dbn.score import Search
 from mbagent.models.dbn.split_search import find_splits
-from mbagent.models.dbn.splits import Search
 from mbagent.models.systematic_sampling import NEGLIGIBLE
 from mbagent.types import Bools, Floats, Ints
 
@@ -404,6 +404,7 @@ def _reset_graphs(
     own = np.zeros(last + 1, dtype=np.bool_)
     own[:-2] = [resets.redrawn[layout.members[b:e]].any() for b, e in zip(layout.first, layout.first[1:-2], strict=False)]
     own[-2] = resets.redrawn[-1]
+    own |= np.isin(layout.mutex_of, layout.mutex_of[own]) & (layout.mutex_of >= 0)
     reset = _graphs(table, dict.fromkeys(np.flatnonzero(own).tolist(), rare), rare, False, in_pairs)
     if own[:-1].all() and not resets.jointly:
         return reset, Part(no_synchronic(reset.graphs))
@@ -475,6 +476,14 @@ def _cardinalities(layout: Layout) -> NDArray[np.int64]:
     lone = np.flatnonzero(np.diff(layout.first) == 1)
     cardinalities[layout.members[layout.first[lone]]] = layout.outputs[lone]
     return cardinalities
+
+
+def indicator_rates(layout: Layout, rows: TransitionBatch, flags: Bools) -> Floats:
+    """Probability that a transition is flagged, given state and action, from a decision graph fitted to the flags [N], [N]."""
+    table, every, last = _Table(layout, rows, flags, NO_EFFECTS, None), np.arange(len(rows)), len(layout.outputs) - 1
+    graphs = _graphs(table, {last: every}, every, True, False).graphs
+    rates: Floats = sampling.reset_rates(rows.states, rows.actions, layout, graphs)
+    return rates
 
 
 def _graphs(table: _Table, rows_of: Mapping[int, Ints], observed: Ints, regular: bool, in_pairs: bool) -> Part:

@@ -9,17 +9,20 @@ patterns have graphs of their own (see ``fitting.Resets``).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaln
 
 from mbagent.data import Factors, TransitionBatch
 from mbagent.models.dbn import sampling
 from mbagent.models.dbn.features import variable_values
-from mbagent.models.dbn.fitting import ROWS_AT_ONCE, UNCERTAIN, Fitted
+from mbagent.models.dbn.fitting import ROWS_AT_ONCE, UNCERTAIN, Fitted, indicator_rates
+from mbagent.models.held_out import thinned
 from mbagent.types import Bools, Floats, Ints
 from mbagent_envs.random_keys import derive
 
@@ -34,56 +37,119 @@ FEWEST = 4
 """Minimum number of rows of a pattern."""
 
 MOST_PROBABILITIES = 20_000_000
-"""Maximum number of rows times values; of more rows, an evenly spaced subset is used."""
+"""Maximum number of rows times values, and of rows times items; of more rows, an evenly spaced subset is used."""
 
-MOST_ITEMS = 1000
-"""Maximum number of values that are searched for patterns: those with the largest variance."""
+MOST_ITEMS = 500
+"""Maximum number of items that are searched for patterns: those with the largest variance."""
 
-MOST_SEEDS = 1000
+MOST_SEEDS = 500
 """Maximum number of pairs that are extended, for each action."""
 
-LARGEST = 8
-"""Maximum number of values in a pattern."""
+MOST_EVENT_KINDS = 16
+"""Maximum number of patterns, each of which is a kind of event."""
 
-MOST_PATTERNS = 8
-"""Maximum number of patterns."""
-
-DRAWS = 60_000
+PATTERN_DRAWS = 60_000
 """Number of draws in all from which the probability of a pattern is estimated if its variables depend on each other."""
 
-
-class Pattern(NamedTuple):
-    """Values that occur together.
-
-    Attributes:
-        variables, values: the values, int64 [K].
-        action: the action class after which they do, or -1 for all.
-        observed: number of rows.
-        expected: number of rows that the graphs predict.
-        chance: first estimate of the probability that such a row is an event.
-    """
-
-    variables: Ints
-    values: Ints
-    action: int
-    observed: int
-    expected: float
-    chance: float
+VALUE, LEAST, MOST, CHANGE = range(4)
+"""Kinds of items: the next value is a number, at least a number, at most a number, or the current value plus a number."""
 
 
-class _Items(NamedTuple):
-    """Values that are searched for patterns, each less frequent than the others of its variable together.
+class Items(NamedTuple):
+    """Unexpected outcomes of single variables, each less probable than one half in the rows where it counts.
 
     Attributes:
-        variable, value: of each item, int64 [I], in the order in which the variables are drawn.
-        shown: which rows have the value, float32 [N, I].
-        chances: its probability, given the values of variables drawn earlier, float32 [N, I].
+        variable, kind, number: of each item, int64 [I]; the variables are in the order in which they are drawn.
     """
 
     variable: Ints
-    value: Ints
-    shown: Floats
-    chances: Floats
+    kind: Ints
+    number: Ints
+
+    def some(self, which: Ints) -> Items:
+        """Some of the items."""
+        return Items(*(part[which] for part in self))
+
+
+class Pattern(NamedTuple):
+    """Items that occur together.
+
+    Attributes:
+        items: the items.
+        action: the action class after which they do, or -1 for all.
+        observed: number of rows.
+        expected: number of rows that the graphs predict.
+        scale: the same, divided by what it would be if the items were independent given the state and action.
+        chance: if not NaN, the probability that such a row is an event; else it follows from the rate of the pattern.
+    """
+
+    items: Items
+    action: int
+    observed: int
+    expected: float
+    scale: float
+    chance: float
+
+
+class Table(NamedTuple):
+    """Transitions as values of variables.
+
+    Attributes:
+        now, then: current and next values, the latter with the end of the episode, int64 [N, U - 2] and [N, U - 1].
+        chances: distribution of each variable, given the next values of those that it depends on, float32 [N, sum of values].
+        start: where each variable's values begin in ``chances``, int64 [U + 1].
+    """
+
+    now: Ints
+    then: Ints
+    chances: NDArray[np.float32]
+    start: Ints
+
+    def select(self, rows: Ints) -> Table:
+        """Some of the rows."""
+        return Table(self.now[rows], self.then[rows], self.chances[rows], self.start)
+
+    def occurs(self, items: Items) -> Bools:
+        """Which transitions have which items, however probable these are, bool [N, I]."""
+        columns = [np.zeros((len(self.then), 0), dtype=np.bool_)]
+        for variable, kind, number in zip(*items, strict=True):
+            then = self.then[:, variable]
+            if kind == CHANGE:
+                columns.append((then == self.now[:, variable] + number)[:, None])
+            else:
+                columns.append(
+                    (then == number if kind == VALUE else then >= number if kind == LEAST else then <= number)[:, None]
+                )
+        return np.concatenate(columns, axis=1)
+
+    def probabilities(self, items: Items) -> NDArray[np.float32]:
+        """Probability of each item, float32 [N, I]."""
+        result, rows = np.zeros((len(self.then), len(items.kind)), dtype=np.float32), np.arange(len(self.then))
+        for i, (variable, kind, number) in enumerate(zip(*items, strict=True)):
+            own = self.chances[:, self.start[variable] : self.start[variable + 1]]
+            if kind == CHANGE:
+                target = self.now[:, variable] + number
+                inside = (target >= 0) & (target < own.shape[1])
+                result[:, i] = own[rows, np.where(inside, target, 0)] * inside
+            else:
+                begin, end = (
+                    (number, number + 1) if kind == VALUE else (number, own.shape[1]) if kind == LEAST else (0, number + 1)
+                )
+                result[:, i] = own[:, begin:end].sum(axis=1)
+        return result
+
+
+def table_of_rows(fitted: Fitted, rows: TransitionBatch) -> Table:
+    """The transitions with their distributions."""
+    layout, graphs, synchronic = fitted.layout, fitted.usual, fitted.synchronic
+    parts = [
+        sampling.conditionals(p.states, p.actions, p.next_states, layout, graphs, synchronic).astype(np.float32)
+        for p in rows.parts(ROWS_AT_ONCE)
+    ]
+    chances = np.concatenate([np.zeros((0, int(graphs.start[-1])), dtype=np.float32), *parts])
+    return Table(
+        variable_values(layout, rows.before).astype(np.int64), _seen(fitted, rows.after, rows.terminated), chances, graphs.start
+    )
 
 
 def ratio(observed: ArrayLike, expected: ArrayLike) -> Floats:
@@ -102,10 +168,9 @@ def find_patterns(fitted: Fitted, rows: TransitionBatch) -> list[Pattern]:
         fitted: graphs without events.
         rows: the transitions that they were fitted to, without resets.
     """
-    n = max(1, MOST_PROBABILITIES // int(fitted.usual.start[-1]))
-    if len(rows) > n:
-        rows = rows.select(np.linspace(0, len(rows) - 1, n).astype(np.int64))
-    items = _items(fitted, rows)
+    rows = thinned(rows, max(1, MOST_PROBABILITIES // max(int(fitted.usual.start[-1]), MOST_ITEMS)))
+    table = table_of_rows(fitted, rows)
+    items = _candidates(fitted, table)
     if len(np.unique(items.variable)) < 2:
         return []
     classes = fitted.layout.encoding.action_class[rows.actions]
@@ -113,42 +178,41 @@ def find_patterns(fitted: Fitted, rows: TransitionBatch) -> list[Pattern]:
     found: list[Pattern] = []
     for action in [*several, -1] if len(several) > 1 else [-1]:
         here = np.flatnonzero(classes == action) if action >= 0 else np.arange(len(rows))
-        part = items._replace(shown=items.shown[here], chances=items.chances[here])
-        draws = max(1, DRAWS // len(rows))
-        search = _Search(fitted, rows.select(here), part, int(action), float(np.log(len(several) + 1.0)), draws)
-        for pattern in [*search.ends(), *search.patterns()]:
-            if not any(_overlap(pattern, other) for other in found if action < 0 or other.action == action):
-                found.append(pattern)
-    return sorted(found, key=lambda pattern: pattern.expected - pattern.observed)[:MOST_PATTERNS]
+        draws = max(1, PATTERN_DRAWS // len(rows))
+        search = _Search(
+            fitted, rows.select(here), table.select(here), items, int(action), float(np.log(len(several) + 1.0)), draws
+        )
+        search.leave_out([pattern for pattern in found if action < 0])
+        found += [*search.ends(), *search.patterns()]
+    return sorted(found, key=lambda pattern: pattern.expected - pattern.observed)[:MOST_EVENT_KINDS]
 
 
-def _overlap(one: Pattern, other: Pattern) -> bool:
-    """Whether two patterns share two values or more."""
-    same = (one.variables[:, None] == other.variables) & (one.values[:, None] == other.values)
-    return int(same.sum()) > 1
+def _candidates(fitted: Fitted, table: Table) -> Items:
+    """The items that are searched."""
+    layout, synchronic, last = fitted.layout, fitted.synchronic, len(fitted.layout.outputs) - 1
+    parts: list[tuple[int, int, int]] = []
+    for variable in [*(v for v in range(last) if v not in synchronic.changing), *synchronic.changing.tolist()]:
+        n = int(layout.outputs[variable])
+        parts += [(variable, VALUE, value) for value in range(n)]
+        if n > 2:
+            parts += [(variable, kind, value) for value in range(1, n - 1) for kind in (LEAST, MOST)]
+            changes = np.unique(table.then[:, variable] - table.now[:, variable])
+            parts += [(variable, CHANGE, int(change)) for change in changes]
+    items = Items(*np.asarray(parts, dtype=np.int64).reshape(-1, 3).T)
+    spread, count = np.zeros(len(items.kind)), np.zeros(len(items.kind))
+    for begin in range(0, len(items.kind), MOST_ITEMS):
+        which = np.arange(begin, min(begin + MOST_ITEMS, len(items.kind)))
+        shown, chances = _unexpected(table, items.some(which))
+        spread[which], count[which] = (chances * (1.0 - chances)).sum(axis=0), shown.sum(axis=0)
+    kept = np.flatnonzero((spread > UNCERTAIN) & (count >= FEWEST))
+    return items.some(np.sort(kept[np.argsort(-spread[kept], kind="stable")[:MOST_ITEMS]]))
 
 
-def _items(fitted: Fitted, rows: TransitionBatch) -> _Items:
-    """The values that are searched."""
-    layout, graphs, synchronic = fitted.layout, fitted.usual, fitted.synchronic
-    parts = [
-        sampling.conditionals(p.states, p.actions, p.next_states, layout, graphs, synchronic).astype(np.float32)
-        for p in rows.parts(ROWS_AT_ONCE)
-    ]
-    chances = np.concatenate([np.zeros((0, int(graphs.start[-1])), dtype=np.float32), *parts])
-    values = _seen(fitted, rows.after, rows.terminated)
-    last = len(layout.outputs) - 1
-    order = [v for v in range(last) if v not in synchronic.changing and layout.mutex_of[v] < 0]
-    order += [int(v) for v in synchronic.changing if layout.mutex_of[v] < 0]
-    variable = np.concatenate([np.zeros(0, dtype=np.int64), *(np.full(layout.outputs[v], v) for v in order)]).astype(np.int64)
-    value = np.concatenate([np.zeros(0, dtype=np.int64), *(np.arange(layout.outputs[v]) for v in order)]).astype(np.int64)
-    column = graphs.start[variable] + value
-    share = (values[:, variable] == value).mean(axis=0) if len(rows) else np.zeros(len(variable))
-    spread = (chances[:, column] * (1.0 - chances[:, column])).sum(axis=0)
-    kept = np.flatnonzero((spread > UNCERTAIN) & (share * len(rows) >= FEWEST) & (share < 0.5))
-    kept = np.sort(kept[np.argsort(-spread[kept], kind="stable")[:MOST_ITEMS]])
-    variable, value, column = variable[kept], value[kept], column[kept]
-    return _Items(variable, value, (values[:, variable] == value).astype(np.float32), chances[:, column])
+def _unexpected(table: Table, items: Items) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Which transitions have which items, and the probabilities, float32 [N, I]; 0 where an item is probable, except the end."""
+    chances = table.probabilities(items)
+    chances[(chances >= 0.5) & (items.variable < table.then.shape[1] - 1)] = 0.0
+    return (table.occurs(items) & (chances > 0.0)).astype(np.float32), chances
 
 
 class _Search:
@@ -157,22 +221,32 @@ class _Search:
     Args:
         fitted: graphs without events.
         rows: N transitions.
-        items: the values that are searched.
+        table: the same as values.
+        items: the items that are searched.
         action: its class, or -1 for all.
         tests: logarithm of the number of searches.
         draws: number of draws for each transition.
     """
 
-    def __init__(self, fitted: Fitted, rows: TransitionBatch, items: _Items, action: int, tests: float, draws: int) -> None:
+    def __init__(
+        self, fitted: Fitted, rows: TransitionBatch, table: Table, items: Items, action: int, tests: float, draws: int
+    ) -> None:
         """See the class."""
-        self.fitted, self.rows, self.items, self.action, self.tests, self.draws = fitted, rows, items, action, tests, draws
-        self.price = float(np.log(len(items.variable)))
-        self._drawn: Ints | None = None
+        self.fitted, self.rows, self.table, self.items, self.action = fitted, rows, table, items, action
+        self.tests, self.draws = tests, draws
+        self.shown, self.chances = _unexpected(table, items)
+        self.free = np.ones(len(rows), dtype=np.bool_)
+        self._drawn: Table | None = None
+
+    def leave_out(self, patterns: Sequence[Pattern]) -> None:
+        """Transitions with these patterns count for no further ones."""
+        for pattern in patterns:
+            self.free &= ~self.table.occurs(pattern.items).all(axis=1)
 
     def patterns(self) -> list[Pattern]:
-        """Patterns grown from pairs, the most evident first, without those that overlap a better one."""
-        items = self.items
-        observed, expected = items.shown.T @ items.shown, items.shown.T @ items.chances
+        """Patterns grown from pairs, the most evident first."""
+        items, shown = self.items, self.shown
+        observed, expected = shown.T @ shown, shown.T @ self.chances
         pairs = np.triu(ratio(observed, expected), 1)
         pairs[(items.variable[:, None] == items.variable) | (observed < FEWEST)] = 0.0
         seeds = np.argsort(-pairs, axis=None, kind="stable")[:MOST_SEEDS]
@@ -180,114 +254,121 @@ class _Search:
         for one, two in zip(*np.unravel_index(seeds, pairs.shape), strict=True):
             if pairs[one, two] <= 0.0:
                 break
-            rows = np.flatnonzero((items.shown[:, one] > 0.0) & (items.shown[:, two] > 0.0))
-            members, total = self._extended([int(one), int(two)], rows, float(pairs[one, two]) - self.price)
-            evident.append((total - self.price + float(gammaln(len(members) + 1.0)), members))
-        evident.sort(key=lambda entry: -entry[0])
+            rows = np.flatnonzero((shown[:, one] > 0.0) & (shown[:, two] > 0.0))
+            members, evidence = self._extended([int(one), int(two)], rows)
+            evident.append((evidence, sorted(members)))
+        evident.sort(key=lambda entry: (-entry[0], entry[1]))
         found: list[Pattern] = []
-        for evidence, members in evident:
-            if evidence < MARGIN + self.tests or len(found) == MOST_PATTERNS:
+        for i, (evidence, members) in enumerate(evident):
+            if evidence < MARGIN + self.tests or len(found) == MOST_EVENT_KINDS:
                 break
-            pattern = self._pattern(members)
-            if not any(_overlap(pattern, other) for other in found):
-                n_patterns = self.price * len(members) - float(gammaln(len(members) + 1.0))
-                if float(ratio(pattern.observed, pattern.expected)) > MARGIN + n_patterns + self.tests:
+            if i == 0 or members != evident[i - 1][1]:
+                pattern = self._pattern(items.some(np.asarray(members)))
+                if float(ratio(pattern.observed, pattern.expected)) > MARGIN + self._penalty(len(members)) + self.tests:
                     found.append(pattern)
+                    self.leave_out([pattern])
         return found
 
     def ends(self) -> list[Pattern]:
         """Patterns of the transitions that end an episode, more of which are observed than expected."""
-        left, end = self.rows.terminated.copy(), len(self.fitted.layout.outputs) - 2
+        left, end = self.rows.terminated & self.free, len(self.fitted.layout.outputs) - 2
+        over = Items(np.array([end]), np.array([VALUE]), np.array([1]))
         found: list[Pattern] = []
-        for _ in range(MOST_PATTERNS):
+        for _ in range(MOST_EVENT_KINDS):
             rows = np.flatnonzero(left)
-            if len(rows) < FEWEST or left.mean() >= 0.5:
-                break
-            members, _ = self._extended([], rows, 0.0)
+            members = [] if len(rows) < FEWEST or left.mean() >= 0.5 else self._extended([], rows)[0]
             if not members:
                 break
-            left[rows[self.items.shown[rows][:, members].all(axis=1)]] = False
-            together, alone = self._pattern(members, end), self._pattern(members)
+            left[rows[self.shown[rows][:, members].all(axis=1)]] = False
+            common = self.items.some(np.asarray(sorted(members)))
+            together, alone = self._pattern(Items(*map(np.append, common, over))), self._pattern(common)
             gain = max(float(ratio(each.observed, each.expected)) for each in (together, alone)) - self.tests
-            if gain > MARGIN_OF_ENDS:
-                chance = (alone.observed - alone.expected) / together.observed
-                found.append(together._replace(chance=float(np.clip(max(chance, together.chance), 0.0, 1.0))))
+            if gain > MARGIN_OF_ENDS and together.observed:
+                chances = [(alone.observed - alone.expected) / together.observed, 1.0 - together.expected / together.observed]
+                found.append(together._replace(chance=float(np.clip(max(chances), 0.0, 1.0))))
+                self.leave_out(found[-1:])
         return found
 
-    def _extended(self, members: list[int], rows: Ints, total: float) -> tuple[list[int], float]:
-        """A set of items, present in some rows, after adding the most surprising further items; with the total evidence."""
-        items, end = self.items, len(self.fitted.layout.outputs) - 2
-        best, best_total = list(members), total
-        while len(members) < LARGEST:
-            observed, expected = items.shown[rows].sum(axis=0), items.chances[rows].sum(axis=0)
+    def _extended(self, members: list[int], rows: Ints) -> tuple[list[int], float]:
+        """A set of items, present in some rows, after adding the most surprising further items; with its evidence.
+
+        Without items at the beginning, it is that of the items given these rows; else that of the items in all rows.
+        """
+        items, end, given = self.items, len(self.fitted.layout.outputs) - 2, not members
+        best, highest, total = list(members), -math.inf if members else 1.0, 0.0
+        product = np.ones(len(self.rows)) if given else self.chances[:, members].astype(np.float64).prod(axis=1)
+        while True:
+            if members:
+                evidence = total if given else float(ratio(len(rows), product.sum()))
+                evidence -= self._penalty(len(members))
+                if evidence > highest + 1.0:
+                    best, highest = members, evidence
+            observed, expected = self.shown[rows].sum(axis=0), self.chances[rows].sum(axis=0)
             gains = np.where(observed >= FEWEST, ratio(observed, expected), 0.0)
-            gains[np.isin(items.variable, items.variable[members])] = 0.0
-            gains[items.variable == end] = 0.0
+            gains[np.isin(items.variable, items.variable[members]) | (items.variable == end)] = 0.0
             item = int(gains.argmax())
             if gains[item] <= 0.5:
-                break
-            members, total = [*members, item], total + float(gains[item]) - self.price
-            rows = rows[items.shown[rows, item] > 0.0]
-            if total > best_total + 1.0:
-                best, best_total = members, total
-        return best, best_total
+                return best, highest
+            members, total, product = [*members, item], total + float(gains[item]), product * self.chances[:, item]
+            rows = rows[self.shown[rows, item] > 0.0]
 
-    def _pattern(self, members: Sequence[int], *end: int) -> Pattern:
-        """Items as a pattern, optionally with the end of the episode, with numbers of observed and expected rows."""
-        chosen = np.asarray(sorted(members), dtype=np.int64)
-        variables = np.concatenate([self.items.variable[chosen], np.asarray(end, dtype=np.int64)])
-        values = np.concatenate([self.items.value[chosen], np.ones(len(end), dtype=np.int64)])
-        observed = int(_match(self.fitted, self.rows.after, self.rows.terminated, variables, values).sum())
-        if np.isin(variables, self.fitted.synchronic.changing).any() or len(end):
-            drawn = self.drawn()
-            expected = ((drawn[:, variables] == values).all(axis=1).sum() + 0.5) / self.draws
-        else:
-            expected = self.items.chances[:, chosen].astype(np.float64).prod(axis=1).sum()
-        chance = max(0.0, 1.0 - float(expected) / max(observed, 1))
-        return Pattern(variables, values, self.action, observed, float(expected), chance)
+    def _penalty(self, size: int) -> float:
+        """Logarithm of the number of patterns of a size."""
+        return float(size * np.log(len(self.items.kind)) - gammaln(size + 1.0))
 
-    def drawn(self) -> Ints:
-        """Values of all variables in draws from the model, [N * draws, U - 1]."""
+    def _pattern(self, items: Items) -> Pattern:
+        """Items as a pattern, with numbers of observed and expected rows."""
+        shown, chances = _unexpected(self.table, items)
+        observed = int((shown.all(axis=1) & self.free).sum())
+        independent = expected = float(chances.astype(np.float64).prod(axis=1).sum())
+        mutex = self.fitted.layout.mutex_of[items.variable] >= 0
+        if mutex.any() or np.isin(items.variable, self.fitted.synchronic.changing).any():
+            expected = float((_unexpected(self.drawn(), items)[0].all(axis=1).sum() + 0.5) / self.draws)
+        return Pattern(items, self.action, observed, expected, expected / max(independent, 1e-12), math.nan)
+
+    def drawn(self) -> Table:
+        """Draws from the model, [N * draws] rows, with the distributions given what was drawn."""
         if self._drawn is None:
-            f, parts = self.fitted, []
+            f, parts, begin = self.fitted, [], 0
             for part in self.rows.parts(ROWS_AT_ONCE):
                 for copy in range(self.draws):
                     following, over = part.states.copy(), np.zeros(len(part), dtype=np.bool_)
-                    keys = derive(np.arange(len(part), dtype=np.uint64), copy)
+                    keys = derive(np.arange(begin, begin + len(part), dtype=np.uint64), copy)
                     sampling.sample(part.states, part.actions, keys, False, f.layout, f.usual, f.synchronic, following, over)
-                    parts.append(_seen(f, following, over))
-            self._drawn = np.concatenate(parts)
+                    parts.append(table_of_rows(f, replace(part, after=following, terminated=over)))
+                begin += len(part)
+            now, then, chances = (np.concatenate([part[i] for part in parts]) for i in range(3))
+            self._drawn = Table(now, then, chances, parts[0].start)
         return self._drawn
 
 
 def _seen(fitted: Fitted, after: Factors, terminated: Bools) -> Ints:
-    """Values of all variables but the last in next states [N, F] and ends [N], [N, U - 1]."""
-    result: Ints = np.concatenate([variable_values(fitted.layout, after), terminated[:, None]], axis=1)
-    return result
-
-
-def _match(fitted: Fitted, after: Factors, terminated: Bools, variables: Ints, values: Ints) -> Bools:
-    """Which next states [N, F] and ends [N] have the given values of the given variables."""
-    result: Bools = (_seen(fitted, after, terminated)[:, variables] == values).all(axis=1)
-    return result
+    """Values of all variables but the last in next states [N, F] and ends [N], int64 [N, U - 1]."""
+    return np.concatenate([variable_values(fitted.layout, after).astype(np.int64), terminated[:, None]], axis=1)
 
 
 def excess(fitted: Fitted, rows: TransitionBatch, patterns: Sequence[Pattern]) -> Floats:
-    """First estimate of the probability that a transition is an event, [N]."""
-    classes, result = fitted.layout.encoding.action_class[rows.actions], np.zeros(len(rows))
+    """First estimate of the probability that a transition is an event, [N]: by how much its pattern exceeds the prediction."""
+    table, classes = table_of_rows(fitted, rows), fitted.layout.encoding.action_class[rows.actions]
+    result = np.zeros(len(rows))
     for pattern in patterns:
-        here = _match(fitted, rows.after, rows.terminated, pattern.variables, pattern.values)
-        here &= (classes == pattern.action) | (pattern.action < 0)
-        result[here] = np.maximum(result[here], pattern.chance)
-    return result
+        shown, chances = _unexpected(table, pattern.items)
+        here = shown.all(axis=1) & ((classes == pattern.action) | (pattern.action < 0))
+        if np.isfinite(pattern.chance):
+            share = np.full(len(rows), pattern.chance)
+        else:
+            predicted = pattern.scale * chances.astype(np.float64).prod(axis=1)
+            share = 1.0 - predicted / np.maximum(indicator_rates(fitted.layout, rows, here), 1e-12)
+        result[here] = np.maximum(result[here], share[here])
+    return result.clip(0.0, 1.0)
 
 
 def event_chances(fitted: Fitted, rows: TransitionBatch, patterns: Sequence[Pattern]) -> Floats:
     """Probability that a transition with one of the patterns is an event, given graphs with events, [N]; 0 without a pattern."""
     result = np.zeros(len(rows))
-    candidates = np.zeros(len(rows), dtype=np.bool_)
+    candidates, table = np.zeros(len(rows), dtype=np.bool_), table_of_rows(fitted, rows)
     for pattern in patterns:
-        candidates |= _match(fitted, rows.after, rows.terminated, pattern.variables, pattern.values)
+        candidates |= table.occurs(pattern.items).all(axis=1)
     layout, some = fitted.layout, np.flatnonzero(candidates)
     for begin in range(0, len(some), ROWS_AT_ONCE):
         which = some[begin : begin + ROWS_AT_ONCE]
@@ -313,7 +394,7 @@ def settled(chances: Floats) -> Bools:
 def factors_of(fitted: Fitted, patterns: Sequence[Pattern]) -> Bools:
     """Which factors, and whether ``terminated``, the patterns contain, bool [F + 1]."""
     layout, result = fitted.layout, np.zeros(fitted.layout.n_factors + 1, dtype=np.bool_)
-    for variable in np.unique(np.concatenate([p.variables for p in patterns])):
+    for variable in np.unique(np.concatenate([p.items.variable for p in patterns])):
         result[layout.members[layout.first[variable] : layout.first[variable + 1]]] = True
         result[-1] |= variable == len(layout.outputs) - 2
     return result

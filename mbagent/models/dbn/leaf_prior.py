@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from mbagent.models.dbn.splits import Search
+from mbagent.models.dbn.score import Search
 from mbagent.types import Floats, Ints
 
 CERTAIN_RATE = 0.02

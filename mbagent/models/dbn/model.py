@@ -13,20 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.data import TransitionBatch, TransitionDataset
-from mbagent.models.base import FitReport
-from mbagent.models.dbn.arrays import Graphs, build, n_features
+from mbagent.models.dbn.arrays import SAVED, Graphs, build, from_arrays, n_features, table_of, to_arrays
 from mbagent.models.dbn.change_points import last_changes
-from mbagent.models.dbn.effects import EffectModel, Operand, best_effect_models, candidates, likely_operands, more_folds
+from mbagent.models.dbn.effects import (
+    EffectModel,
+    Operand,
+    best_effect_models,
+    candidates,
+    likely_operands,
+    more_folds,
+    smoothing_of,
+)
 from mbagent.models.dbn.features import Layout, action_encoding, is_lone_bit, layout_with_mutexes, make_layout
 from mbagent.models.dbn.fitting import ROWS_AT_ONCE, Fitted, Resets, all_redrawn, fit_graphs, flag_resets, no_synchronic
 from mbagent.models.dbn.joint_events import Pattern, event_chances, excess, factors_of, find_patterns, settled
 from mbagent.models.dbn.mutex import find_groups
-from mbagent.models.dbn.predictions import GraphPredictions
-from mbagent.models.dbn.serialization import SAVED, from_arrays, table_of, to_arrays
-from mbagent.models.dbn.smoothing import smoothing_of
-from mbagent.models.fit_report import Variable, VariableReport, describe
-from mbagent.models.held_out import PERFECT_LOG_PROB, SOME_ROWS, SOME_TESTS, better, thinned, within
-from mbagent.models.markov_test import steps_in_a_row, with_past
+from mbagent.models.dbn.successors import GraphPredictions
+from mbagent.models.held_out import PERFECT_LOG_PROB, SOME_ROWS, SOME_TESTS, better, steps_in_a_row, thinned, with_past, within
+from mbagent.models.protocol import FitReport, Variable, VariableReport, describe
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.types import Bools, Floats
 
@@ -190,8 +194,7 @@ class DecisionGraphModel(GraphPredictions):
         held_out: TransitionBatch,
     ) -> bool:
         """Fits the training rows with joint events, unless they predict clearly worse; returns whether they are kept."""
-        events = settled(excess(plain, train, patterns)) & ~resets
-        candidate = fit(train, self._redrawn(resets, events, patterns))
+        candidate = fit(train, self._redrawn(resets, settled(excess(plain, train, patterns)) & ~resets, patterns))
         if better(self._logs(plain, held_out), self._logs(candidate, held_out)):
             return False
         self.fitted = candidate

@@ -17,6 +17,8 @@ from mbagent.models.dbn.leaf_prior import best_prior
 from mbagent.models.dbn.score import (
     Chosen,
     FeatureBlocks,
+    Pair,
+    Search,
     Tables,
     Target,
     best_split,
@@ -25,7 +27,6 @@ from mbagent.models.dbn.score import (
     evidences,
     feature_blocks,
 )
-from mbagent.models.dbn.splits import Pair, Search
 from mbagent.types import Bools, Floats, Ints
 from mbagent_envs.jit import compiled
 

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from mbagent.data import TransitionDataset
-from mbagent.models.fit_report import FitReport
-from mbagent.models.protocol import TransitionModel
+from mbagent.models.protocol import FitReport, TransitionModel
 
 
 def check_fraction(fraction: float) -> float:

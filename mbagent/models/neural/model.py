@@ -10,16 +10,14 @@ import numpy as np
 import torch
 
 from mbagent.data import TransitionBatch, TransitionDataset
-from mbagent.models.base import FitReport
 from mbagent.models.neural.bit_kernels import CausalBits, pack_bits
 from mbagent.models.neural.connections import PruningConfig, check_fraction
 from mbagent.models.neural.export import CompiledBody, as_rows, compiled_body, pack_dense, pack_groups
 from mbagent.models.neural.gibbs import sample_sweeps
-from mbagent.models.neural.influence import VariableGroup, dependent_groups, influence, modules
 from mbagent.models.neural.kernels import Floats32, GroupWeights, probabilities
 from mbagent.models.neural.network_pair import NO_MARKS, NetworkPair
 from mbagent.models.neural.networks import DensePredictor
-from mbagent.models.neural.pruning import prune_networks
+from mbagent.models.neural.pruning import VariableGroup, dependent_groups, influence, modules, prune_networks
 from mbagent.models.neural.sampling import (
     causal_successors,
     independent_successors,
@@ -30,7 +28,7 @@ from mbagent.models.neural.sampling import (
 from mbagent.models.neural.sparse import n_links, pack_sparse
 from mbagent.models.neural.training import Examples, Trainer, as_examples, examples, one_thread
 from mbagent.models.neural.truth_tables import BitRules, Pair, compile_rules, find_parents, sample_rules, tabulable, tabulate
-from mbagent.models.protocol import Successors, as_keys
+from mbagent.models.protocol import FitReport, Successors, as_keys
 from mbagent.types import Actions, Bools, Floats, Randomness, States
 
 PrunedAs: TypeAlias = Literal["tables", "connections", "matrices"]

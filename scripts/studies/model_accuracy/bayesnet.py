@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.data import TransitionDataset
-from mbagent.models.base import BaseTransitionModel, FitReport
-from mbagent.models.protocol import as_keys
+from mbagent.models.base import BaseTransitionModel
+from mbagent.models.protocol import FitReport, as_keys
 from mbagent.models.registry import register_model
 from mbagent.spaces import FactoredSpace
 from mbagent.types import Actions, Bools, Floats, Randomness, States

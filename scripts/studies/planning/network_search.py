@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mbagent.planning.graph_search import GraphSearch
 from mbagent.planning.planner import PlannerSettings
 from mbagent.types import Ints
+from studies.planning.graph_search import GraphSearch
 from studies.planning.networks import AT_ONCE, BUDGETS, SEEDS, NetworkTask, PairwiseGoal, PeerOnNetworks
 
 MCTX = "mctx, Gumbel MuZero"
-HORIZON, WAVE = 15, 256
+HORIZON, BATCH = 15, 256
 """Maximum steps of a simulation, as in mctx; maximum number of simulations between two calls of the model."""
 
 
@@ -113,7 +113,7 @@ def planner_for(task: NetworkTask, goal: PairwiseGoal, effort: Effort, seed: int
         horizon=HORIZON,
         lookahead_states=effort.lookahead_states,
         lookahead_samples=effort.lookahead_samples,
-        wave=WAVE,
+        batch_size=BATCH,
         seed=seed,
     )
     planner = GraphSearch(settings)

@@ -10,10 +10,10 @@ from typing import Protocol, TypeAlias
 import numpy as np
 
 from mbagent.models.tabular import TabularMDP
-from mbagent.planning.machine_search import known_machine, search_machine
 from mbagent.planning.planner import PlannerSettings, best_actions
 from mbagent.planning.planners import MctsPlanner
 from mbagent.types import Ints
+from studies.planning.machine_search import known_machine, search_machine
 from studies.planning.peers import Speed
 from worlds.random_mdps import RandomMDP
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from mbagent.evaluation.figures import FIGURE_STYLE, to_png
-from mbagent.models.neural.influence import Influence, VariableGroup, dependent_groups, modules
+from mbagent.models.neural.pruning import Influence, VariableGroup, dependent_groups, modules
 
 ALONE = "#eceff2"
 """Colour of a variable that has no links with others."""

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.neural.influence import Influence, dependent_groups, modules
+from mbagent.models.neural.pruning import Influence, dependent_groups, modules
 from mbagent.types import Bools
 from mbagent_envs.flier_catcher import FlierCatcher
 from mbagent_envs.game import Game

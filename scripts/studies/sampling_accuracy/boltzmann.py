@@ -21,10 +21,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mbagent.data import TransitionDataset
-from mbagent.models.base import BaseTransitionModel, FitReport
+from mbagent.models.base import BaseTransitionModel
 from mbagent.models.neural.networks import FactorCodec, uniform
 from mbagent.models.neural.training import Examples, batches, examples, one_cycle, one_thread
-from mbagent.models.protocol import as_keys
+from mbagent.models.protocol import FitReport, as_keys
 from mbagent.types import Actions, Bools, Floats, Randomness, States
 from mbagent_envs.random_keys import derive, uniforms
 

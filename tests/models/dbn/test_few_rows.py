@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from mbagent.models.base import FitReport
 from mbagent.models.dbn import DecisionGraphModel, LocalGraphModel
+from mbagent.models.protocol import FitReport
 from mbagent.spaces import FactoredSpace
 from mbagent_envs.random_keys import derive
 from tests.models.helpers import dataset

@@ -1,5 +1,7 @@
 """Rare events that set several variables at once, each of which often takes such a value by itself."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -96,6 +98,74 @@ def test_two_kinds_of_events_are_told_apart() -> None:
     copy.load_state_dict(model.state_dict())
     for ours, theirs in zip(listed(model, 1), listed(copy, 1), strict=True):
         np.testing.assert_array_equal(ours, theirs)
+
+
+def overlapping(rng: np.random.Generator, action: np.ndarray) -> tuple[Rows, np.ndarray]:
+    """Two kinds of events have a bit in common, and one has more bits than the other."""
+    y = (rng.random((N, 6)) < 0.12).astype(np.int64)
+    u = rng.random(N)
+    y[np.ix_((action == 1) & (u < 0.01), [0, 1, 2])] = 1
+    y[np.ix_((action == 1) & (u > 0.99), [2, 3, 4, 5])] = 1
+    return ((2,) * 6, chained(y), action, y, np.zeros(N, dtype=bool)), (y[:, :3] == 1).all(axis=1)
+
+
+def falling(rng: np.random.Generator, action: np.ndarray) -> tuple[Rows, np.ndarray]:
+    """Three prices fall by two at once; each also falls by two now and then."""
+    before = rng.integers(4, 12, size=(N, 3))
+    change = rng.choice([-2, -1, 1, 0], size=(N, 3), p=[0.08, 0.17, 0.35, 0.4])
+    change[(action == 1) & (rng.random(N) < 0.012)] = -2
+    return ((14,) * 3, before, action, before + change, np.zeros(N, dtype=bool)), (change == -2).all(axis=1)
+
+
+def parked(rng: np.random.Generator, action: np.ndarray) -> tuple[Rows, np.ndarray]:
+    """Three lamps are on for certain while variable 0 is 0; else they flicker, and an event switches all of them on."""
+    driving = rng.integers(2, size=N)
+    lamps = np.where(driving[:, None] == 0, 1, rng.random((N, 3)) < 0.12)
+    lamps[(driving == 1) & (action == 1) & (rng.random(N) < 0.015)] = 1
+    before, after = np.column_stack([driving, lamps[:, ::-1]]), np.column_stack([rng.integers(2, size=N), lamps])
+    return ((2,) * 4, before, action, after, np.zeros(N, dtype=bool)), (lamps == 1).all(axis=1) & (driving == 1)
+
+
+def at_most_one(rng: np.random.Generator, action: np.ndarray) -> tuple[Rows, np.ndarray]:
+    """At most one of four bits is on; an event switches one of them on with two others."""
+    which = rng.integers(10, size=N)
+    after = np.column_stack([which[:, None] == np.arange(4), rng.random((N, 2)) < 0.2]).astype(np.int64)
+    after[(action == 1) & (rng.random(N) < 0.015)] = [0, 0, 1, 0, 1, 1]
+    return ((2,) * 6, chained(after), action, after, np.zeros(N, dtype=bool)), (after[:, [2, 4, 5]] == 1).all(axis=1)
+
+
+def many(rng: np.random.Generator, action: np.ndarray) -> tuple[Rows, np.ndarray]:
+    """An event switches twelve bits on, each of which is on in 30% of steps."""
+    after = (rng.random((N, 12)) < 0.3).astype(np.int64)
+    after[(action == 1) & (rng.random(N) < 0.01)] = 1
+    return ((2,) * 12, chained(after), action, after, np.zeros(N, dtype=bool)), (after == 1).all(axis=1)
+
+
+def chained(after: np.ndarray) -> np.ndarray:
+    return np.vstack([np.zeros_like(after[:1]), after[:-1]])
+
+
+@pytest.mark.parametrize("world", [overlapping, falling, parked, at_most_one, many])
+def test_kinds_of_events(world: Callable[[np.random.Generator, np.ndarray], tuple[Rows, np.ndarray]]) -> None:
+    rng = np.random.default_rng(1)
+    action = rng.integers(2, size=N)
+    rows, event = world(rng, action)
+    before = rows[1]
+    model = fitted(rows)
+    for a in range(2):
+        here = np.flatnonzero(action == a)
+        copies = np.repeat(here, 20)
+        drawn, _ = model.sample(before[copies], np.full(len(copies), a), np.random.default_rng(7))
+        if world is falling:
+            found = (drawn - before[copies] == -2).all(axis=1)
+        else:
+            own = {"overlapping": [0, 1, 2], "parked": [1, 2, 3], "at_most_one": [2, 4, 5], "many": list(range(12))}
+            columns = own[world.__name__]
+            found = (drawn[:, columns] == 1).all(axis=1)
+            if world is parked:
+                found &= before[copies, 0] == 1
+        n = event[here].sum()
+        assert found.mean() == pytest.approx(n / len(here), abs=2.5 * np.sqrt(n + 4) / len(here))
 
 
 def test_nothing_is_found_where_variables_are_independent_or_their_dependence_is_learned() -> None:

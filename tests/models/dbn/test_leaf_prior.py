@@ -3,8 +3,7 @@ import pytest
 from scipy.special import comb
 
 from mbagent.models.dbn.leaf_prior import CENTRES, MIXED_STRENGTH, LeafPrior, MixedPrior, best_prior, fitted_prior
-from mbagent.models.dbn.score import Target
-from mbagent.models.dbn.splits import Search
+from mbagent.models.dbn.score import Search, Target
 from mbagent.types import Floats, Ints
 
 EQUAL = MixedPrior(0.1, MIXED_STRENGTH, np.full(len(CENTRES), 1.0 / len(CENTRES)))

@@ -5,9 +5,18 @@ import pytest
 from scipy import special
 
 from mbagent.models.dbn.mutex import find_cliques, find_groups
-from mbagent.models.dbn.score import BY_ALL, BY_CONTEXT, Target, best_split, count, evidence, evidence_tables, feature_blocks
+from mbagent.models.dbn.score import (
+    BY_ALL,
+    BY_CONTEXT,
+    Search,
+    Target,
+    best_split,
+    count,
+    evidence,
+    evidence_tables,
+    feature_blocks,
+)
 from mbagent.models.dbn.split_search import find_splits
-from mbagent.models.dbn.splits import Search
 
 RNG = np.random.default_rng(0)
 

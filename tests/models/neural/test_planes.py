@@ -5,8 +5,8 @@ from gymnasium import spaces
 
 from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.models import FactorCodec, NeuralConfig, NeuralTransitionModel, TrainingConfig
+from mbagent.models.neural.export import pack_planes, plane_logits
 from mbagent.models.neural.networks import PlanePredictor
-from mbagent.models.neural.plane_kernels import pack_planes, plane_logits
 from mbagent.models.registry import build_networks
 from mbagent.spaces import FactoredSpace
 from mbagent_envs.maneuverer import Maneuverer

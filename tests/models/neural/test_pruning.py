@@ -5,11 +5,10 @@ import pytest
 import torch
 
 from mbagent.data import TransitionDataset
-from mbagent.models.neural.influence import influence
 from mbagent.models.neural.model import NeuralTransitionModel
 from mbagent.models.neural.network_pair import NeuralConfig
 from mbagent.models.neural.networks import Affine, DensePredictor
-from mbagent.models.neural.pruning import Judge, trim_layer
+from mbagent.models.neural.pruning import Judge, influence, trim_layer
 from mbagent.models.neural.training import Examples, TrainingConfig, examples
 from tests.models.helpers import dataset
 from tests.models.neural.test_connections import N_BITS, fitted, shifted

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mbagent.data import Factors, TransitionBatch
 from mbagent.models.dbn.arrays import Graphs, build
+from mbagent.models.dbn.effects import smoothing_of
 from mbagent.models.dbn.features import ActionEncoding, Layout, Observed, Question, ask, distinct, make_layout
 from mbagent.models.dbn.planes.features import (
     ACTION,
@@ -31,10 +32,8 @@ from mbagent.models.dbn.planes.features import (
     informative_features,
     values_at,
 )
-from mbagent.models.dbn.score import Tables, Target, evidence_tables, evidences, feature_blocks
-from mbagent.models.dbn.smoothing import smoothing_of
+from mbagent.models.dbn.score import Search, Split, Tables, Target, evidence_tables, evidences, feature_blocks
 from mbagent.models.dbn.split_search import certainty, find_splits, go_on
-from mbagent.models.dbn.splits import Search, Split
 from mbagent.spaces import PlaneLayout
 from mbagent.types import Bools, Ints
 from mbagent_envs.jit import compiled

@@ -15,30 +15,35 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mbagent.data import TransitionBatch, TransitionDataset
-from mbagent.models.base import FitReport
 from mbagent.models.dbn import sampling
-from mbagent.models.dbn.arrays import Graphs, build
+from mbagent.models.dbn.arrays import SAVED, Graphs, build, from_arrays, table_of, to_arrays
 from mbagent.models.dbn.change_points import last_changes
+from mbagent.models.dbn.effects import smoothing_of
 from mbagent.models.dbn.features import Layout, Observed, Question, ask, distinct
 from mbagent.models.dbn.fitting import UNCERTAIN, Fitted, all_redrawn, fit_graphs, go_together, no_synchronic, uncertain_rows
 from mbagent.models.dbn.model import IMPOSSIBLE_LOG_PROB, DecisionGraphModel, depends_on_action, tested_features
 from mbagent.models.dbn.planes.features import (
+    COLUMN,
     NEXT,
     NEXT_ADJACENCY,
+    ROW,
+    WHOLE,
+    LocalGraphs,
+    Mutex,
     Reach,
     feature_name,
     feature_values,
+    instantiate,
     relative_features,
     shifted,
+    with_invariants,
+    with_mutexes,
 )
-from mbagent.models.dbn.planes.grounding import COLUMN, ROW, WHOLE, LocalGraphs, Mutex, instantiate, with_invariants, with_mutexes
 from mbagent.models.dbn.planes.invariants import NO_INVARIANTS, Invariants, all_kept, find_invariants, n_combinations
 from mbagent.models.dbn.planes.large_data import PlaneTable, channel_layout, refine
-from mbagent.models.dbn.serialization import SAVED, from_arrays, table_of, to_arrays
-from mbagent.models.dbn.smoothing import smoothing_of
-from mbagent.models.dbn.splits import Search
-from mbagent.models.fit_report import Variable
+from mbagent.models.dbn.score import Search
 from mbagent.models.held_out import PERFECT_LOG_PROB, SOME_ROWS, SOME_TESTS, better, thinned
+from mbagent.models.protocol import FitReport, Variable
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.types import Bools, Floats, Ints
 

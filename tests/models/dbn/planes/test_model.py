@@ -16,15 +16,17 @@ from mbagent.models.dbn.planes.features import (
     ACTION,
     BORDER,
     CELL,
+    COLUMN,
     NEXT,
     NEXT_ADJACENCY,
+    WHOLE,
     WRAP,
+    Mutex,
     Reach,
     feature_kinds,
     feature_values,
     relative_features,
 )
-from mbagent.models.dbn.planes.grounding import COLUMN, WHOLE, Mutex
 from mbagent.spaces import FactoredSpace
 from mbagent_envs import FlierCatcher, Maneuverer
 from mbagent_envs.random_keys import derive

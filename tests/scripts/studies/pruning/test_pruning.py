@@ -7,7 +7,7 @@ import pytest
 
 from harness import write_csv
 from mbagent.evaluation.statistics import mean_interval
-from mbagent.models.neural.influence import Influence
+from mbagent.models.neural.pruning import Influence
 from mbagent_envs import FlierCatcher
 from pruning import main
 from studies.pruning import measures

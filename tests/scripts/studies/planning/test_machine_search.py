@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from mbagent.planning.machine_search import KnownMachine, known_machine, search_machine
 from mbagent.types import Floats
+from studies.planning.machine_search import KnownMachine, known_machine, search_machine
 from tests.worlds import optimal_q, random_table
 
 GAMMA = 0.9

@@ -16,13 +16,12 @@ import numpy as np
 
 from mbagent.models.mdp import GraphArrays, StateGraph
 from mbagent.planning.lookahead import grow_lookahead
-from mbagent.planning.machine_search import BOUND_BELOW, BOUND_TOP, MOST_VISITS
 from mbagent.planning.planners import Expanded, ValueIterationPlanner
-from mbagent.planning.value_function import LOWEST_KNOWN
-from mbagent.planning.value_iteration import TOLERANCE, Values, bellman, break_ties, score_edges, settle, sweep
+from mbagent.planning.value_iteration import LOWEST_KNOWN, TOLERANCE, Values, bellman, break_ties, score_edges, settle, sweep
 from mbagent.types import Floats, Ints, States
 from mbagent_envs.jit import borrowed, compiled, inlined
 from mbagent_envs.random_keys import derive, derive_one, mix
+from studies.planning.machine_search import BOUND_BELOW, BOUND_TOP, MOST_VISITS
 
 FIRST_SWEEPS, GROWING_SWEEPS, GRAPH_FINAL_SWEEPS = 10, 3, 100
 """Maximum number of sweeps of value iteration: before the first simulation, after each expansion, after the last simulation."""
@@ -30,8 +29,8 @@ FIRST_SWEEPS, GROWING_SWEEPS, GRAPH_FINAL_SWEEPS = 10, 3, 100
 GRAPH_LEAF_SAMPLES = 4
 """Number of samples for each (state, action) of a node that the search expands."""
 
-FIRST_WAVE, WAVE_SHARE = 8, 4
-"""Simulations of the first batch; the size of later ones is at most the number of earlier simulations divided by WAVE_SHARE."""
+FIRST_BATCH, BATCH_SHARE = 8, 4
+"""Simulations of the first batch; the size of later ones is at most the number of earlier simulations divided by BATCH_SHARE."""
 
 _GRAPH_SALT = 0x6EA6C4
 _GRAPH_STEP = np.uint64(0x9E3779B97F4A7C15)
@@ -74,7 +73,7 @@ class Rules(NamedTuple):
 
     Attributes:
         n_simulations: for each root.
-        wave: maximum number of simulations of a root in a batch.
+        batch_size: maximum number of simulations of a root in a batch.
         gamma: discount of a step.
         c_uct: weight of exploration.
         prior_visits: number of visits that an initial value counts as.
@@ -82,7 +81,7 @@ class Rules(NamedTuple):
     """
 
     n_simulations: int
-    wave: int
+    batch_size: int
     gamma: float
     c_uct: float
     prior_visits: int
@@ -93,7 +92,7 @@ class GraphSearch(ValueIterationPlanner):
     """UCT on lookaheads around the roots, for thousands of simulations.
 
     Every search starts from the values of a lookahead, each of which counts as ``prior_visits`` visits, and expands it where
-    simulations leave it. ``wave`` bounds the number of simulations of a root between two calls of the model.
+    simulations leave it. ``batch_size`` bounds the number of simulations of a root between two calls of the model.
 
     Attributes:
         expanded: number of successors sampled from the model so far; equal ones of a (state, action) are counted once.
@@ -109,13 +108,13 @@ class GraphSearch(ValueIterationPlanner):
         zeros, n_simulations = np.zeros((len(graph), graph.model.n_actions)), settings.num_simulations
         first = Values(zeros[:, 0].copy(), zeros, score_edges(graph, self._known_goal()), np.zeros(len(roots)))
         settle(graph, first, settings.gamma, FIRST_SWEEPS)
-        tables = _tables(graph, first, len(roots), min(settings.wave, n_simulations), settings.horizon)
+        tables = _tables(graph, first, len(roots), min(settings.batch_size, n_simulations), settings.horizon)
         weigh(graph.arrays, tables, settings.gamma, 0)
         measure_spans(graph.arrays, tables)
         key = np.uint64(derive(settings.seed, _GRAPH_SALT)[0])
-        rules = Rules(n_simulations, settings.wave, settings.gamma, settings.c_uct, int(settings.prior_visits), key)
+        rules = Rules(n_simulations, settings.batch_size, settings.gamma, settings.c_uct, int(settings.prior_visits), key)
         done, growths = np.zeros(2, dtype=np.int64), 0
-        while n := run_waves(graph.arrays, nodes, tables, rules, BOUND_TOP, BOUND_BELOW, done):
+        while n := run_batches(graph.arrays, nodes, tables, rules, BOUND_TOP, BOUND_BELOW, done):
             growths += 1
             tables = self._grown(graph, nodes, tables, n, int(derive(settings.seed, _GRAPH_SALT, growths)[0]))
         size, n_edges = len(graph), graph.n_edges
@@ -136,14 +135,14 @@ class GraphSearch(ValueIterationPlanner):
         return tables
 
 
-def _tables(graph: StateGraph, first: Values, n_roots: int, wave: int, horizon: int) -> Tables:
+def _tables(graph: StateGraph, first: Values, n_roots: int, batch_size: int, horizon: int) -> Tables:
     """Tables before the first simulation."""
     tables = Tables(
         first.v, first.q, first.rewards, first.frontier,
         np.zeros(first.q.shape, dtype=np.int64), np.zeros(len(first.v), dtype=np.int64),
         np.empty(len(first.rewards)), np.empty(first.q.shape),
-        np.empty((n_roots, wave, horizon, 2), dtype=np.int64), np.zeros((n_roots, wave), dtype=np.int64),
-        np.empty(n_roots * wave, dtype=np.int64), np.empty(n_roots), np.zeros((n_roots, graph.model.n_actions)),
+        np.empty((n_roots, batch_size, horizon, 2), dtype=np.int64), np.zeros((n_roots, batch_size), dtype=np.int64),
+        np.empty(n_roots * batch_size, dtype=np.int64), np.empty(n_roots), np.zeros((n_roots, graph.model.n_actions)),
     )  # fmt: skip
     return _lengthened(tables, len(graph.arrays.tags), len(graph.arrays.sources))
 
@@ -262,13 +261,13 @@ def _back_up(
 
 
 @compiled
-def _run_wave(graph: GraphArrays, roots: Ints, t: Tables, rules: Rules, top: Floats, below: Floats, done: int, wave: int) -> int:
+def _run_batch(graph: GraphArrays, roots: Ints, t: Tables, rules: Rules, top: Floats, below: Floats, done: int, size: int) -> int:
     """Runs the simulations of a batch; returns the number of distinct unexpanded nodes that they reach."""
     q, n, met, path, lengths, leaves, n_leaves = t.q, t.n, t.met, t.path, t.lengths, t.leaves, 0
     for r in range(len(roots)):
         root, scale = roots[r], rules.c_uct * t.spans[r]
         noise = derive_one(rules.key, np.uint64(done))  # the same for every root
-        for w in range(wave):
+        for w in range(size):
             lengths[r, w], leaf, noise = _descend(
                 r, w, root, noise, scale, rules.prior_visits, graph, top, below, q, n, met, path
             )
@@ -281,7 +280,7 @@ def _run_wave(graph: GraphArrays, roots: Ints, t: Tables, rules: Rules, top: Flo
 
 
 @compiled
-def run_waves(graph: GraphArrays, roots: Ints, tables: Tables, rules: Rules, top: Floats, below: Floats, done: Ints) -> int:
+def run_batches(graph: GraphArrays, roots: Ints, tables: Tables, rules: Rules, top: Floats, below: Floats, done: Ints) -> int:
     """Runs batches until all simulations are done, or a batch reaches unexpanded nodes.
 
     Args:
@@ -302,9 +301,9 @@ def run_waves(graph: GraphArrays, roots: Ints, tables: Tables, rules: Rules, top
             for w in range(done[1]):
                 _back_up(r, w, t.lengths[r, w], graph, t.weight, t.income, t.q, t.v, t.path)
         done[0] += done[1]
-        done[1] = min(max(done[0] // WAVE_SHARE, FIRST_WAVE), rules.wave, rules.n_simulations - done[0])
+        done[1] = min(max(done[0] // BATCH_SHARE, FIRST_BATCH), rules.batch_size, rules.n_simulations - done[0])
         if done[1] == 0:
             return 0
-        n_leaves = _run_wave(graph, roots, t, rules, top, below, done[0], done[1])
+        n_leaves = _run_batch(graph, roots, t, rules, top, below, done[0], done[1])
         if n_leaves > 0:
             return n_leaves

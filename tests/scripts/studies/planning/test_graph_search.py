@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from mbagent.planning.graph_search import GraphSearch
 from mbagent.planning.planner import Planner, PlannerSettings
 from mbagent.planning.planners import ValueIterationPlanner
 from mbagent.types import Floats
+from studies.planning.graph_search import GraphSearch
 from tests.worlds import optimal_q, planner_for, prize_corridor, random_table
 
 
@@ -51,7 +51,7 @@ def test_a_plan_does_not_depend_on_the_batch() -> None:
 @pytest.mark.parametrize(("n", "wave"), [(1, 16), (7, 16), (100, 1), (1000, 256)])
 def test_every_simulation_goes_through_an_action_of_the_root(n: int, wave: int) -> None:
     table, rewards = random_table(25, 3, 1), np.random.default_rng(1).normal(size=25)
-    planner = planner_alone(GraphSearch(PlannerSettings(num_simulations=n, wave=wave, lookahead_states=5)), table, rewards)
+    planner = planner_alone(GraphSearch(PlannerSettings(num_simulations=n, batch_size=wave, lookahead_states=5)), table, rewards)
     plan = planner.plan(np.array([[0], [9]]))
     assert plan.visits.sum(axis=1).tolist() == [n, n]
     if n == 1000:
