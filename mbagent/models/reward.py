@@ -147,7 +147,8 @@ class RewardReport:
 
     Attributes:
         n_values: number of distinct observed rewards.
-        right: share of transitions whose predicted reward is right within 0.5% of the range of rewards.
+        right: share of transitions whose reward is the predicted mean, within 0.5% of the range of rewards, or the most probable
+            one.
         held_out: the same for the episodes held out in the first fit, as measured then; NaN if there are none.
         contrary: share of transitions with another reward than the most frequent one of those that cannot be distinguished: with
             the same observation, action and next observation, or with the same prediction of decision graphs.
@@ -387,12 +388,15 @@ class LearnedReward:
 
     def _log_likelihood(self, rows: TransitionBatch) -> float:
         """Log-probability of the rewards of all rows, predicted as classes."""
-        if self._graphs is not None:
-            chances = self._graph_chances(rows.states, rows.actions, rows.next_states)[:, np.argsort(np.argsort(self._order))]
-        else:
-            chances = self._outputs(rows.states, rows.actions, rows.next_states).double().softmax(dim=1).numpy()
-        own = chances[np.arange(len(rows)), np.searchsorted(self._values, rows.rewards)]
+        own = self._chances(rows)[np.arange(len(rows)), np.searchsorted(self._values, rows.rewards)]
         return float(np.log(np.maximum(own, LEAST_PROBABILITY)).sum())
+
+    def _chances(self, rows: TransitionBatch) -> Floats:
+        """Probability of each distinct reward, ascending, [N, K]."""
+        if self._graphs is not None:
+            return self._graph_chances(rows.states, rows.actions, rows.next_states)[:, np.argsort(self._order)]
+        chances: Floats = self._outputs(rows.states, rows.actions, rows.next_states).double().softmax(dim=1).numpy()
+        return chances
 
     def _graph_chances(self, states: States, actions: Actions, next_states: States) -> Floats:
         """Probability of each reward, in the order of ``_order``, [M, K], from the graphs."""
@@ -402,9 +406,12 @@ class LearnedReward:
         return chances
 
     def _share_right(self, rows: TransitionBatch, weights: NDArray[np.float32] | None = None) -> float:
+        """Share of rows whose reward is the predicted mean or the most probable one."""
         value_range = float(np.ptp(self._values)) if self._classes else 6.0 * float(self._values[1])
-        close = np.abs(self(rows.states, rows.actions, rows.next_states) - rows.rewards) <= 0.005 * max(value_range, 1e-12)
-        return float(np.average(close, weights=weights))
+        right = np.abs(self(rows.states, rows.actions, rows.next_states) - rows.rewards) <= 0.005 * max(value_range, 1e-12)
+        if self._classes and len(self._values) > 1:
+            right |= self._values[self._chances(rows).argmax(axis=1)] == rows.rewards
+        return float(np.average(right, weights=weights))
 
     def _train(self, rows: TransitionBatch, weights: Tensor, steps: int) -> None:
         states, actions, next_states = (torch.from_numpy(part) for part in (rows.states, rows.actions, rows.next_states))

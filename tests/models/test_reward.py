@@ -172,6 +172,22 @@ def test_random_rewards_are_predicted_by_their_mean_whatever_else_varies(chance:
     np.testing.assert_allclose(predicted[~mine], 0.1, atol=1e-9)
 
 
+def test_insurance_is_priced_by_the_mean_of_rare_losses_whatever_else_varies() -> None:
+    rng, n = np.random.default_rng(0), 12_000
+    position, actions, noise = np.arange(n) % 4, rng.integers(2, size=n), rng.integers(2, size=(n + 1, 8))
+    before, after = np.column_stack([position, noise[:-1]]), np.column_stack([(position + 1) % 4, noise[1:]])
+    u = rng.random(n)
+    losses = np.select([u < 0.005, u < 0.009, u < 0.012], [-100.0, -60.0, -40.0], 0.0)
+    rewards = np.where(actions == 0, -0.5, losses)
+    model = LearnedReward((4,) + (2,) * 8, 2)
+    report = model.fit(TransitionBatch(before, actions, after, np.zeros(n, dtype=np.bool_), rewards, np.arange(n) // 50))
+    predicted = model(before, actions, after)
+    for a in range(2):
+        np.testing.assert_allclose(predicted[actions == a], rewards[actions == a].mean(), atol=1e-9)
+    assert report.held_out > 0.98
+    assert report.advice is None
+
+
 def test_random_rewards_of_transitions_that_hardly_recur_are_reported() -> None:
     data = rows(4000)
     wide = [
