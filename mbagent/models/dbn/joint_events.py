@@ -42,7 +42,7 @@ MOST_PROBABILITIES = 20_000_000
 MOST_ITEMS = 500
 """Maximum number of items that are searched for patterns: those with the largest variance."""
 
-MOST_SEEDS = 500
+MOST_SEEDS = 100
 """Maximum number of pairs that are extended, for each action."""
 
 MOST_EVENT_KINDS = 16
