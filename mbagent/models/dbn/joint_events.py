@@ -349,39 +349,42 @@ def _seen(fitted: Fitted, after: Factors, terminated: Bools) -> Ints:
 
 def excess(fitted: Fitted, rows: TransitionBatch, patterns: Sequence[Pattern]) -> Floats:
     """First estimate of the probability that a transition is an event, [N]: by how much its pattern exceeds the prediction."""
-    table, classes = table_of_rows(fitted, rows), fitted.layout.encoding.action_class[rows.actions]
-    result = np.zeros(len(rows))
-    for pattern in patterns:
-        shown, chances = _unexpected(table, pattern.items)
-        here = shown.all(axis=1) & ((classes == pattern.action) | (pattern.action < 0))
+    classes, result = fitted.layout.encoding.action_class[rows.actions], np.zeros(len(rows))
+    has, predicted = np.zeros((len(patterns), len(rows)), dtype=np.bool_), np.zeros((len(patterns), len(rows)))
+    begin = 0
+    for part in rows.parts(ROWS_AT_ONCE):
+        table, these = table_of_rows(fitted, part), slice(begin, begin + len(part))
+        for k, pattern in enumerate(patterns):
+            shown, chances = _unexpected(table, pattern.items)
+            has[k, these], predicted[k, these] = shown.all(axis=1), chances.astype(np.float64).prod(axis=1)
+        begin += len(part)
+    for k, pattern in enumerate(patterns):
+        here = has[k] & ((classes == pattern.action) | (pattern.action < 0))
         if np.isfinite(pattern.chance):
             share = np.full(len(rows), pattern.chance)
         else:
-            predicted = pattern.scale * chances.astype(np.float64).prod(axis=1)
-            share = 1.0 - predicted / np.maximum(indicator_rates(fitted.layout, rows, here), 1e-12)
+            share = 1.0 - pattern.scale * predicted[k] / np.maximum(indicator_rates(fitted.layout, rows, here), 1e-12)
         result[here] = np.maximum(result[here], share[here])
     return result.clip(0.0, 1.0)
 
 
 def event_chances(fitted: Fitted, rows: TransitionBatch, patterns: Sequence[Pattern]) -> Floats:
     """Probability that a transition with one of the patterns is an event, given graphs with events, [N]; 0 without a pattern."""
-    result = np.zeros(len(rows))
-    candidates, table = np.zeros(len(rows), dtype=np.bool_), table_of_rows(fitted, rows)
-    for pattern in patterns:
-        candidates |= table.occurs(pattern.items).all(axis=1)
-    layout, some = fitted.layout, np.flatnonzero(candidates)
-    for begin in range(0, len(some), ROWS_AT_ONCE):
-        which = some[begin : begin + ROWS_AT_ONCE]
-        part = rows.select(which)
+    layout, parts = fitted.layout, [np.zeros(0)]
+    for part in rows.parts(ROWS_AT_ONCE):
+        table, candidate = table_of_rows(fitted, part), np.zeros(len(part), dtype=np.bool_)
+        for pattern in patterns:
+            candidate |= table.occurs(pattern.items).all(axis=1)
         usual, event = (
             sampling.log_prob(part.states, part.actions, part.next_states, part.terminated, layout, graphs, synchronic)
             for graphs, synchronic in ((fitted.usual, fitted.synchronic), (fitted.reset, fitted.reset_synchronic))
         )
         rate = sampling.reset_rates(part.states, part.actions, layout, fitted.usual)
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             odds = np.log(rate) + event - np.log1p(-rate) - usual
-        result[which] = 1.0 / (1.0 + np.exp(-odds.clip(-50.0, 50.0)))
-    return result
+        odds[np.isnan(odds)] = -np.inf  # impossible with and without an event
+        parts.append(np.where(candidate, 1.0 / (1.0 + np.exp(-odds.clip(-50.0, 50.0))), 0.0))
+    return np.concatenate(parts)
 
 
 def settled(chances: Floats) -> Bools:
