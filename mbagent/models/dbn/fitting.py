@@ -119,10 +119,8 @@ class Asked(NamedTuple):
 
 def probabilities(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Floats:
     """Marginal probability of each feature of the next state for each row, [N, D']."""
-    sizes = np.full(layout.n_factors, 2, dtype=np.int64)
-    np.maximum.at(sizes, layout.factor, layout.top + 1)
-    start = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    probs = np.empty((len(rows), int(start[-1])))
+    start = np.concatenate([[0], np.cumsum(_cardinalities(layout))]).astype(np.int64)
+    probs = np.zeros((len(rows), int(start[-1])))
     sampling.marginals(rows.states, rows.actions, layout, graphs, start, probs)
     total = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(probs, axis=1)], axis=1)
     result: Floats = total[:, start[layout.factor] + layout.top + 1] - total[:, start[layout.factor] + layout.value]

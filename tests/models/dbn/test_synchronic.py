@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from mbagent.models.dbn import DecisionGraphModel, LocalGraphModel
+from mbagent.models.dbn import DecisionGraphModel, LocalGraphModel, fitting
 from mbagent.spaces import FactoredSpace
 from mbagent_envs.random_keys import derive
 from tests.models.helpers import dataset, outcome_numbers, outcomes
@@ -148,3 +148,15 @@ def test_states_that_violate_a_group_have_valid_probabilities() -> None:
         ones = np.ones(len(listed.states), dtype=np.int64)
         logs = model.log_prob(np.tile(broken, (len(ones), 1)), ones, listed.states, listed.terminated)
         np.testing.assert_allclose(np.exp(logs), listed.probabilities, atol=0.01)
+
+
+def test_probabilities_beside_a_constant_factor_do_not_depend_on_what_memory_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    states, actions, following, ends = tied_world(500, 1)
+    states, following = (np.insert(array, 1, 0, axis=1) for array in (states, following))
+    model, rows = DecisionGraphModel((2, 1, 2, 3), 2), dataset((2, 1, 2, 3), 2, states, actions, following, ends)
+    model.fit(rows)
+    layout, graphs, batch = model.fitted.layout, model.fitted.usual, rows.rows()
+    clean, empty = fitting.probabilities(layout, graphs, batch), np.empty
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "empty", lambda shape, dtype=np.float64: empty(shape, dtype) + np.inf)
+        np.testing.assert_array_equal(fitting.probabilities(layout, graphs, batch), clean)
