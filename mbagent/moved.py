@@ -69,9 +69,8 @@ _FORMERLY = {
     "models.dbn.score": "models.graphs.evidence models.graphs.search",
     "models.dbn.split_search": "models.graphs.greedy models.graphs.pairs",
     "models.dbn.successors": "models.graphs.listing models.graphs.predictions models.graphs.whole",
-    "models.neural.bit_kernels": "models.bit_networks models.causal_bits",
     "models.neural.connections": "models.pruning",
-    "models.neural.export": "models.packing models.plane_kernels",
+    "models.neural.export": "models.packing",
     "models.neural.forecasts": "models.forecasts",
     "models.neural.gibbs": "models.sweep_blocks models.sweeps",
     "models.neural.kernels": "models.arithmetic models.kernels",
@@ -80,7 +79,6 @@ _FORMERLY = {
     "models.neural.pruning": "models.evidence models.modules models.retraining",
     "models.neural.sampling": "models.samplers",
     "models.neural.sampling models.systematic_sampling": "models.systematic",
-    "models.neural.sparse": "models.sparse_networks",
     "models.neural.training": "models.training",
     "models.neural.truth_tables": "models.bit_rules models.tabulate",
 }

@@ -10,9 +10,8 @@ import numpy as np
 import torch
 
 from mbagent.data import TransitionBatch, TransitionDataset
-from mbagent.models.neural.bit_kernels import CausalBits, pack_bits
 from mbagent.models.neural.connections import PruningConfig, check_fraction
-from mbagent.models.neural.export import CompiledBody, as_rows, compiled_body, pack_dense, pack_groups
+from mbagent.models.neural.export import CompiledBody, as_rows, compiled_body, pack_groups
 from mbagent.models.neural.gibbs import sample_sweeps
 from mbagent.models.neural.kernels import Floats32, GroupWeights, probabilities
 from mbagent.models.neural.network_pair import NO_MARKS, NetworkPair
@@ -25,25 +24,20 @@ from mbagent.models.neural.sampling import (
     sample_causal,
     sample_independent,
 )
-from mbagent.models.neural.sparse import n_links, pack_sparse
 from mbagent.models.neural.training import Examples, Trainer, as_examples, examples, one_thread
 from mbagent.models.neural.truth_tables import BitRules, Pair, compile_rules, find_parents, sample_rules, tabulable, tabulate
 from mbagent.models.protocol import FitReport, Successors, as_keys
 from mbagent.types import Actions, Bools, Floats, Randomness, States
 
-PrunedAs: TypeAlias = Literal["tables", "connections", "matrices"]
-
-FEW = 0.2
-"""Share of remaining connections below which sparse lists are faster than dense matrices."""
+PrunedAs: TypeAlias = Literal["tables", "matrices"]
 
 
 class NeuralTransitionModel(NetworkPair):
     """A predictor network, alone or with a conditioner network. Arguments are those of NetworkPair.
 
     Attributes:
-        pruned_as: representation from which a pruned model of bits is sampled: "tables" (truth tables of bits with few
-            remaining inputs; the connections of the others, if these are few), "connections" of all bits, or dense
-            "matrices", as before pruning.
+        pruned_as: representation from which a pruned model of bits is sampled: truth "tables" if all bits have few remaining
+            inputs, or dense "matrices", as before pruning.
     """
 
     pruned_as: PrunedAs = "tables"
@@ -51,8 +45,7 @@ class NeuralTransitionModel(NetworkPair):
     def _changed(self) -> None:
         self._forward: CompiledBody | None = None
         self._groups: GroupWeights | None = None
-        self._packed_bits: CausalBits | None = None
-        self._rules: dict[tuple[str, float], tuple[BitRules | None, BitRules | None]] = {}
+        self._rules: dict[float, tuple[BitRules, BitRules]] = {}
 
     @one_thread()
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
@@ -267,32 +260,18 @@ class NeuralTransitionModel(NetworkPair):
             seed,
         )
 
-    def kernel(self) -> CausalBits | BitRules | None:
-        """The networks, possibly pruned, for compiled search (see ``models.overloads``); None if not supported."""
-        if self.config.conditioner != "causal" or not isinstance(self.predictor, DensePredictor):
-            return None
-        if (rules := self.rules(settled=True)) is not None:
-            return rules
-        if self._packed_bits is None:
-            dense = pack_dense(self.predictor)
-            self._packed_bits = pack_bits(dense, self._packed_groups(), self._layout, self.config.certain)
-        return self._packed_bits
+    def kernel(self) -> BitRules | None:
+        """The truth tables of pruned networks, for compiled search (see ``models.overloads``); None if there are none."""
+        return self.rules(settled=True)
 
     def rules(self, settled: bool = False) -> BitRules | None:
-        """Rules of a pruned model of bits, for sampling or, with ``settled``, for search; None for any other model."""
-        if not len(self._marks) or self.pruned_as == "matrices" or (pair := self._pair()) is None:
+        """Truth tables of a pruned model of bits, for sampling or, with ``settled``, for search; None for any other model."""
+        if not len(self._marks) or self.pruned_as == "matrices" or not tabulable(self._marks) or (pair := self._pair()) is None:
             return None
-        key = (self.pruned_as, self.config.certain)
-        if key not in self._rules:
-            few = tabulable(self._marks) & (self.pruned_as == "tables")
-            networks = None if few.all() else pack_sparse(pair.predictor, pair.conditioner, self.config.certain, ~few)
-            many = FEW * sum(part.total for part in self.connections().values()) if self.pruned_as == "tables" else np.inf
-            if not few.all() and (networks is None or n_links(networks) > many):
-                self._rules[key] = (None, None)
-            else:
-                left = tabulate(pair, self._marks, few), networks, self.codec.n_actions
-                self._rules[key] = (compile_rules(*left), compile_rules(*left, settled=True))
-        return self._rules[key][settled]
+        if self.config.certain not in self._rules:
+            tables, n = tabulate(pair, self._marks), self.codec.n_actions
+            self._rules[self.config.certain] = compile_rules(tables, n), compile_rules(tables, n, settled=True)
+        return self._rules[self.config.certain][settled]
 
     def modules(self) -> list[VariableGroup]:
         """The independent groups of variables (paper section 5), largest first; see ``influence.modules``.

@@ -2,8 +2,8 @@
 
 Each outcome bit has a table over the few bits on which it still depends, of the state and of earlier outcome bits; a sample is
 one look-up. The parents of a bit are the inputs connected to it by some path whose effect exceeds a tolerance; all other inputs
-are fixed to their modes, and the resulting error is measured on transitions. A bit with too many parents for a table is
-sampled with the remaining connections of its networks (``sparse.py``).
+are fixed to their modes, and the resulting error is measured on transitions. Networks of which some bit has too many parents
+for a table have none.
 Shapes: F bits of a state, O = F + 1 of an outcome (``terminated`` last), A actions.
 """
 
@@ -17,12 +17,24 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mbagent.models.neural.bit_kernels import settled_chance, write_outcomes
 from mbagent.models.neural.networks import ACTIVATIONS, Affine, Conditioner, DensePredictor
-from mbagent.models.neural.sparse import Room, SparseNetworks, ask, leans_on_open, room_for, see_action, see_state
 from mbagent.models.neural.training import Examples
 from mbagent.models.overloads import Outcomes, implements, outcomes, work_for
-from mbagent.models.systematic_sampling import MAIN, STRATA, Particles, begin, bit_chances, new_particles, place_of, share_out
+from mbagent.models.systematic_sampling import (
+    MAIN,
+    MASS,
+    NEGLIGIBLE,
+    STRATA,
+    Particles,
+    begin,
+    bit_chances,
+    n_outcomes,
+    new_particles,
+    place_of,
+    share_out,
+    slot_of,
+    weigh,
+)
 from mbagent.types import Floats, Ints, Keys
 from mbagent_envs.jit import borrowed, compiled, inlined
 from mbagent_envs.random_keys import uniform_at
@@ -160,18 +172,17 @@ class Sample(NamedTuple):
         return float(torch.dot((chances(pair, changed, i) - known[differs]).abs(), self.weights[differs]))
 
 
-def tabulable(marks: Marks) -> NDArray[np.bool_]:
-    """Mask of the outcome bits with few enough parents for a table, bool [O]."""
-    few: NDArray[np.bool_] = (marks == PARENT).sum(axis=1) <= MOST_PARENTS
-    return few
+def tabulable(marks: Marks) -> bool:
+    """Whether all outcome bits have few enough parents for a table."""
+    return bool(((marks == PARENT).sum(axis=1) <= MOST_PARENTS).all())
 
 
 @torch.no_grad()
-def tabulate(pair: Pair, marks: Marks, which: NDArray[np.bool_]) -> list[Table | None]:
-    """Tables of the outcome bits ``which`` over their parents in ``marks``; None for all other bits."""
+def tabulate(pair: Pair, marks: Marks) -> list[Table]:
+    """Tables of all outcome bits over their parents in ``marks``."""
     codec, reach = pair.predictor.codec, paths(pair)
     acts = [bool(row[codec.n_state_columns : codec.n_inputs].any()) for row in reach]
-    return [_table(pair, marks[i], acts[i], i) if which[i] else None for i in range(len(marks))]
+    return [_table(pair, marks[i], acts[i], i) for i in range(len(marks))]
 
 
 def _table(pair: Pair, marks: Marks, acts: bool, i: int) -> Table:
@@ -221,17 +232,15 @@ class Table(NamedTuple):
 
 
 class BitRules(NamedTuple):
-    """Tables and networks.
+    """Tables of all outcome bits.
 
     Attributes:
         table: probabilities of all tables, concatenated.
-        bits: a row for each outcome bit that is not a copy, in order, int64 [R, 6]: the bit; the start of its table, -1 if the
-            networks are used; the offset of the next action's table; the start of its parents in the state, their start in the
-            outcome, and their end.
+        bits: a row for each outcome bit that is not a copy, in order, int64 [R, 6]: the bit; the start of its table; the offset
+            of the next action's table; the start of its parents in the state, their start in the outcome, and their end.
         parents: parents of all tables, int64.
         copies: a row for each other bit, int64 [O - R, 4]: the bit; a bit of the state; its value if that bit is 0; if it is 1.
         n_actions: A.
-        networks: networks of the bits without a table; None if all have one.
     """
 
     table: Floats
@@ -239,26 +248,19 @@ class BitRules(NamedTuple):
     parents: Ints
     copies: Ints
     n_actions: int
-    networks: SparseNetworks | None
 
 
-def compile_rules(
-    tables: Sequence[Table | None], networks: SparseNetworks | None, n_actions: int, settled: bool = False
-) -> BitRules:
-    """Combines the tables, one or None for each outcome bit, to rules.
+def compile_rules(tables: Sequence[Table], n_actions: int, settled: bool = False) -> BitRules:
+    """Combines the tables, one for each outcome bit, to rules.
 
     Args:
         tables: the tables; probabilities close to 0 or 1 are rounded.
-        networks: networks of the bits without a table.
         n_actions: A.
-        settled: whether to omit negligible values as search does, see ``bit_kernels.settled_chance``.
+        settled: whether to omit negligible values as search does, see ``settled_chance``.
     """
     least, chances, bits, copies, size = IMPROBABLE_TOLERANCE / len(tables), [np.zeros(0)], [], [], 0
     parents: list[int] = []
     for i, table in enumerate(tables):
-        if table is None:
-            bits.append((i, -1, 0, len(parents), len(parents), len(parents)))
-            continue
         sure = np.where(table.chances < least, 0.0, np.where(table.chances > 1.0 - least, 1.0, table.chances))
         one = table.simplified(np.vectorize(settled_chance, otypes=[np.float64])(sure) if settled else sure)
         flat = one.chances.reshape(len(one.chances), -1)
@@ -271,7 +273,7 @@ def compile_rules(
         chances.append(flat.ravel())
         size += flat.size
     rows, fixed = np.array(bits, dtype=np.int64).reshape(-1, 6), np.array(copies, dtype=np.int64).reshape(-1, 4)
-    return BitRules(np.concatenate(chances), rows, np.array(parents, dtype=np.int64), fixed, n_actions, networks)
+    return BitRules(np.concatenate(chances), rows, np.array(parents, dtype=np.int64), fixed, n_actions)
 
 
 @inlined
@@ -291,30 +293,33 @@ def _by_state(r: int, action: int, state: Ints, bits: Ints, parents: Ints) -> tu
     return place, weight
 
 
+@inlined
+def settled_chance(one: float) -> float:
+    """Probability ``one`` of a bit, pruned as by ``systematic_sampling.prune``."""
+    if one < NEGLIGIBLE * (1.0 - one):
+        return 0.0
+    if 1.0 - one < NEGLIGIBLE * one:
+        return 1.0
+    return one
+
+
 @compiled
 def sample_rules(states: Ints, actions: Ints, keys: Keys, rules: BitRules) -> tuple[Ints, NDArray[np.bool_]]:
     """Samples next states int64 [B, F] and ``terminated`` bool [B]: bit i of row b uses number i of key b, as in ``sampling``."""
     n_bits, k = states.shape[1], borrowed(rules)
-    table, bits, parents, copies, networks, room = k.table, k.bits, k.parents, k.copies, k.networks, room_for(k.networks)
-    drawn, ended, none = np.empty_like(states), np.zeros(len(states), dtype=np.bool_), np.zeros((1, 1), dtype=np.int64)
-    outcome, chances, conditioned = np.zeros(n_bits + 1, dtype=np.int64), room.chances, room.conditioned
+    table, bits, parents, copies = k.table, k.bits, k.parents, k.copies
+    drawn, ended = np.empty_like(states), np.zeros(len(states), dtype=np.bool_)
+    outcome = np.zeros(n_bits + 1, dtype=np.int64)
     for b in range(len(states)):
         action, state = actions[b], states[b]
         _copy(state, copies, outcome)
-        see_state(networks, room, state)
-        see_action(networks, room, state, action)
         for r in range(len(bits)):
             i = bits[r, 0]
-            if bits[r, 1] >= 0:
-                place, weight = _by_state(r, action, state, bits, parents)
-                for v in range(bits[r, 4], bits[r, 5]):
-                    place += weight * outcome[parents[v]]
-                    weight *= 2
-                one = table[place]
-            elif conditioned[i]:
-                one = ask(networks, room, i, action, 0, state, outcome, none[0], none)
-            else:
-                one = chances[i]
+            place, weight = _by_state(r, action, state, bits, parents)
+            for v in range(bits[r, 4], bits[r, 5]):
+                place += weight * outcome[parents[v]]
+                weight *= 2
+            one = table[place]
             if one <= 0.0 or one >= 1.0:
                 outcome[i] = int(one >= 1.0)
             else:
@@ -331,14 +336,12 @@ class RulesWork(NamedTuple):
         open: the open bits, int64 [O].
         slot: index of each open bit among the open bits, int64 [O].
         p: particles.
-        room: work space of the networks.
     """
 
     base: Ints
     open: Ints
     slot: Ints
     p: Particles
-    room: Room
 
 
 @implements(work_for, BitRules)
@@ -351,7 +354,6 @@ def rules_work(k: BitRules, n_grid: int) -> RulesWork:
         np.empty(n_outputs, dtype=np.int64),
         np.empty(n_outputs, dtype=np.int64),
         new_particles(n_grid, n_outputs, 2),
-        room_for(k.networks),
     )
 
 
@@ -368,51 +370,55 @@ def _by_outcome(q: int, place: int, weight: int, v: int, end: int, parents: Ints
     return place
 
 
+@inlined
+def _write_outcomes(total: int, base: Ints, still_open: Ints, p: Particles, n_grid: int, out: Outcomes) -> int:
+    """Writes the outcomes of an action with their probabilities, from index ``total``; returns their number."""
+    weigh(p, n_grid)
+    for i in range(n_outcomes(p)):
+        slot = slot_of(p, i, n_grid)
+        for w in range(len(still_open)):
+            base[still_open[w]] = p.factors[slot, w]
+        for f in range(len(base) - 1):
+            out.states[total + i, f] = base[f]
+        out.terminated[total + i] = base[len(base) - 1] == 1
+        out.probabilities[total + i] = p.chances[slot, MASS]
+    return n_outcomes(p)
+
+
 @implements(outcomes, BitRules)
 @compiled
 def rules_outcomes(k: BitRules, work: RulesWork, state: Ints, n_grid: int, key: np.uint64, offset: float, out: Outcomes) -> int:
     """See ``models.overloads``."""
-    table, bits, parents, networks, room, base, slot = k.table, k.bits, k.parents, k.networks, work.room, work.base, work.slot
-    grid, total, still_open, p, chances, conditioned = (n_grid, key, offset), 0, work.open, work.p, room.chances, room.conditioned
+    table, bits, parents, base, slot = k.table, k.bits, k.parents, work.base, work.slot
+    grid, total, still_open, p = (n_grid, key, offset), 0, work.open, work.p
     factors, values = p.factors, np.empty(2, dtype=np.float64)
-    see_state(networks, room, state)
     _copy(state, k.copies, base)
     last = len(base) - 1
     for action in range(k.n_actions):
-        see_action(networks, room, state, action)
         n_open = 0
         begin(p, n_grid, False, place_of(state))  # the open bits are not known in advance
         for r in range(len(bits)):
-            i, start, end, chance = bits[r, 0], bits[r, 4], bits[r, 5], 0.5
+            i, start, end = bits[r, 0], bits[r, 4], bits[r, 5]
             place, weight = _by_state(r, action, state, bits, parents)
-            shared = not (place < 0 and conditioned[i] and leans_on_open(networks, i, base))
+            shared = True
             for v in range(start, end):
                 shared = shared and base[parents[v]] >= 0
             if shared:  # the same for all particles
-                if place < 0 and conditioned[i]:
-                    chance = settled_chance(ask(networks, room, i, action, 0, state, base, slot, factors))
-                elif place < 0:
-                    chance = settled_chance(chances[i])
-                else:
-                    chance = table[_by_outcome(0, place, weight, start, end, parents, base, slot, factors)]
+                chance = table[_by_outcome(0, place, weight, start, end, parents, base, slot, factors)]
                 if chance <= 0.0 or chance >= 1.0:
                     base[i] = int(chance >= 1.0)
                     continue
+                bit_chances(chance, values)
             base[i], slot[i], still_open[n_open] = -1, n_open, i
             if shared:
-                bit_chances(chance, values)
                 share_out(p, -1, i, n_open, values, 2, i == last, grid)
             n_main, n_strata = p.state[MAIN], p.state[STRATA]
             for j in range(0 if shared else n_main + n_strata):
                 q = n_grid + j if j < n_strata else j - n_strata  # strata first
-                if place < 0:
-                    chance = settled_chance(ask(networks, room, i, action, q, state, base, slot, factors))
-                else:
-                    chance = table[_by_outcome(q, place, weight, start, end, parents, base, slot, factors)]
-                bit_chances(chance, values)
+                bit_chances(table[_by_outcome(q, place, weight, start, end, parents, base, slot, factors)], values)
                 share_out(p, q, i, n_open, values, 2, i == last, grid)
             n_open += 1
-        out.counts[action] = write_outcomes(total, base, still_open[:n_open], p, n_grid, out)
+        out.counts[action] = _write_outcomes(total, base, still_open[:n_open], p, n_grid, out)
         out.left_out[action] = p.left[0]
         total += out.counts[action]
     return total

@@ -55,7 +55,7 @@ NOTES = {
     "values of the true game: with its own goal, and with random rewards of the columns (mean over goals); 1 is the regret of a "
     "random action. Times per decision, for one root and for 16 at once. mctx samples a next state in every simulation; mbagent "
     "keeps the expanded successors of a state and searches in them. Pruned: the same networks without at least nine in ten "
-    "connections, compiled for the remaining ones.",
+    "connections, compiled to truth tables.",
     "equal regret": "The cheapest effort of mbagent with no more regret than mctx with a given budget, under the random goals.",
 }
 """Explanations of the tables."""

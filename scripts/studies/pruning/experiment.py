@@ -84,7 +84,7 @@ class Row:
         log_likelihood: loss in nats per transition relative to the true model, on unseen play; nan if the true model has no
             exact probabilities.
         marginal: total variation of single variables from the true ones, mean over variables and inputs.
-        full, matrices, connected, used, variation: see ``measures.Speeds``.
+        full, matrices, used, variation: see ``measures.Speeds``.
         parents: mean number of parents of a variable; before pruning, all variables connected to it by a path.
         precision, recall: precision and recall of the parents; nan if the true ones are not known.
         conditions_precision, conditions_recall: the same for dependencies between next variables.
@@ -103,7 +103,6 @@ class Row:
     marginal: float
     full: float
     matrices: float
-    connected: float
     used: float
     variation: float
     parents: float

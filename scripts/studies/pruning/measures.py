@@ -29,15 +29,13 @@ class Speeds(NamedTuple):
     Attributes:
         full: with whole matrices, where every variable with a group in the conditioner is sampled from it.
         matrices: with whole matrices, without the variables of which the predictor is certain.
-        connections: with lists of the remaining connections.
-        used: as the model is actually sampled: with tables, and with lists for variables with too many parents.
+        used: as the model is actually sampled: with tables, if no variable has too many parents for one.
         variation: upper bound of the total variation between ``used`` and ``matrices``: 95% limit of the share of samples that
             differ with the same random numbers.
     """
 
     full: float
     matrices: float
-    connections: float
     used: float
     variation: float
 
@@ -59,7 +57,6 @@ def measure_speeds(model: NeuralTransitionModel, states: Any, actions: Any, seed
     return Speeds(
         timed(EVERYTHING, "matrices"),
         timed(certain, "matrices"),
-        timed(certain, "connections"),
         timed(certain, "tables"),
         float(limit) if model.rules() is not None else 0.0,
     )

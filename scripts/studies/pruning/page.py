@@ -38,7 +38,6 @@ COLUMNS: dict[str, tuple[str, int]] = {
     "marginal": ("Error of single variables", 5),
     "full": ("µs, all asked", 2),
     "matrices": ("µs, matrices", 2),
-    "connected": ("µs, connections", 2),
     "used": ("µs, as used", 2),
     "speed_up": ("Times the speed", 1),
     "variation": ("Total variation", 4),
@@ -128,10 +127,10 @@ NOTE = (
     "Nats lost: difference to the true model's log-likelihood per transition, on unseen play. Error of single variables: "
     "total variation between 200 samples of the model and of the game, which sampling noise alone makes larger than 0. "
     "µs: processor time of one next state in a batch of 1,024; all asked: every variable with a group in the conditioner "
-    "is sampled from it; matrices and connections: without those of which the predictor is certain; as used: tables, and lists "
-    "of connections for variables with too many parents. Times the speed: of the unpruned networks, all asked. Total "
-    "variation: between tables and whole matrices, upper 95% limit. Parents: state variables that a variable depends on. "
-    "Precision and recall: of these against the true dependencies. Modules found: share of the true ones, found exactly."
+    "is sampled from it; matrices: without those of which the predictor is certain; as used: tables, if no variable has too many "
+    "parents for one. Times the speed: of the unpruned networks, all asked. Total variation: between tables and whole "
+    "matrices, upper 95% limit. Parents: state variables that a variable depends on. Precision and recall: of these against the "
+    "true dependencies. Modules found: share of the true ones, found exactly."
 )
 
 

@@ -10,7 +10,6 @@ from mbagent.models.neural.model import NeuralTransitionModel
 from mbagent.models.neural.network_pair import NeuralConfig
 from mbagent.models.neural.networks import PlanePredictor
 from mbagent.models.neural.training import TrainingConfig
-from mbagent.models.neural.truth_tables import PARENT
 from mbagent.spaces import PlaneLayout
 from tests.models.helpers import dataset
 
@@ -113,16 +112,3 @@ def test_models_without_uncertain_factors_are_pruned_too() -> None:
     drawn, ended = model.sample(nothing, actions, np.random.default_rng(1))
     assert not drawn.any()
     assert not ended.any()
-
-
-def test_dense_matrices_are_used_if_many_connections_remain() -> None:
-    data = shifted(400)
-    model = fitted(data)
-    model.prune(data, 0.1, config=PruningConfig(evidence=False))
-    model._marks[:] = PARENT
-    model.load_state_dict(model.state_dict())
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mbagent.models.neural.truth_tables.MOST_PARENTS", 1)
-        assert model.rules() is None
-        model.pruned_as = "connections"
-        assert model.rules() is not None

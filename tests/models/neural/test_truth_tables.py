@@ -1,6 +1,7 @@
-"""Truth tables and connections of pruned networks: the same predictions as those of the matrices."""
+"""Truth tables of pruned networks: the same predictions as those of the matrices."""
 
 from collections.abc import Iterator
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from mbagent.models.mdp import StateGraph
 from mbagent.models.neural.connections import PruningConfig
 from mbagent.models.neural.model import NeuralTransitionModel, PrunedAs
-from mbagent.models.neural.truth_tables import MOST_PARENTS, PARENT, BitRules, Table, compile_rules
+from mbagent.models.neural.truth_tables import MOST_PARENTS, BitRules, Table, compile_rules
 from mbagent_envs.random_keys import derive
 from tests.models.neural.test_connections import N_BITS, fitted, shifted
 
@@ -30,48 +31,27 @@ def pruned(learned: NeuralTransitionModel) -> Iterator[NeuralTransitionModel]:
     learned.load_state_dict(weights)
 
 
-def few_tables(model: NeuralTransitionModel, monkeypatch: pytest.MonkeyPatch) -> BitRules:
-    """Rules as if most bits had too many remaining parents."""
-    monkeypatch.setattr("mbagent.models.neural.truth_tables.MOST_PARENTS", int(np.median((model._marks == PARENT).sum(axis=1))))
-    model.load_state_dict(model.state_dict())
-    model.pruned_as = "tables"
-    rules = model.rules()
-    assert rules is not None
-    assert rules.networks is not None
-    assert 0 < rules.networks.asked.sum() < N_BITS + 1
-    assert (rules.bits[:, 1] < 0).sum() == rules.networks.asked.sum()
-    return rules
-
-
 def drawn(model: NeuralTransitionModel, pruned_as: PrunedAs) -> np.ndarray:
     model.pruned_as = pruned_as
     rows = shifted(seed=5).rows()
     return np.column_stack(model.sample(rows.states, rows.actions, derive(1, np.arange(len(rows.states)))))
 
 
-def test_samples_are_those_of_the_matrices(pruned: NeuralTransitionModel, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_are_those_of_the_matrices(pruned: NeuralTransitionModel) -> None:
     rules = pruned.rules()
     assert rules is not None
-    assert rules.networks is None
     assert (rules.bits[:, 5] - rules.bits[:, 3]).max() <= MOST_PARENTS
     assert sorted([*rules.bits[:, 0], *rules.copies[:, 0]]) == list(range(N_BITS + 1))
     theirs = drawn(pruned, "matrices")
     assert (drawn(pruned, "tables") != theirs).any(axis=1).mean() <= 0.005
-    assert np.array_equal(drawn(pruned, "connections"), theirs)  # equal up to rounding
-    few_tables(pruned, monkeypatch)
-    assert (drawn(pruned, "tables") != theirs).any(axis=1).mean() <= 0.005
 
 
-def test_only_remaining_connections_are_included(pruned: NeuralTransitionModel) -> None:
-    pruned.pruned_as = "connections"
-    rules, left = pruned.rules(), pruned.connections()
-    assert rules is not None
-    assert rules.networks is not None
-    assert rules.networks.asked.all()
-    assert len(rules.networks.inputs.weight) + len(rules.networks.outputs.weight) <= left["predictor"].left
-    groups = rules.networks.groups
-    assert len(groups.links.weight) + len(groups.readout) <= left["conditioner"].left
-    assert groups.grouped.any()
+def test_there_are_no_tables_if_a_bit_has_too_many_parents(
+    pruned: NeuralTransitionModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mbagent.models.neural.truth_tables.MOST_PARENTS", 1)
+    assert pruned.rules() is None
+    assert pruned.kernel() is None
 
 
 def test_tables_survive_saving(pruned: NeuralTransitionModel) -> None:
@@ -84,18 +64,13 @@ def test_tables_survive_saving(pruned: NeuralTransitionModel) -> None:
         assert np.array_equal(getattr(first, name), getattr(second, name))
 
 
-@pytest.mark.parametrize("pruned_as", ["tables", "mixed", "connections"])
-def test_compiled_search_has_the_same_outcomes(
-    pruned: NeuralTransitionModel, pruned_as: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_compiled_search_has_the_same_outcomes(pruned: NeuralTransitionModel) -> None:
     graphs = []
     states = np.unique(np.random.default_rng(0).integers(2, size=(40, N_BITS)), axis=0)
-    for way in (pruned_as, "matrices"):
-        if way == "mixed":
-            few_tables(pruned, monkeypatch)
-        pruned.pruned_as = "tables" if way == "mixed" else way  # type: ignore[assignment]
+    for form in get_args(PrunedAs):
+        pruned.pruned_as = form
         graphs.append(StateGraph(pruned))
-        assert isinstance(graphs[-1].kernel, BitRules) == (way != "matrices")
+        assert isinstance(graphs[-1].kernel, BitRules) == (form == "tables")
         graphs[-1].expand(graphs[-1].add(states, np.zeros(len(states), dtype=np.int64)), 8, seed=3)
     found = []
     for graph in graphs:
@@ -122,9 +97,9 @@ def test_improbable_values_are_treated_as_impossible() -> None:
         Table((), (), np.array([0.005])),
         Table((), (0,), np.array([[0.1, 1.0]])),
     ]
-    rules = compile_rules(tables, None, 2)
+    rules = compile_rules(tables, 2)
     assert rules.copies.tolist() == [[0, 0, 0, 1]]
     assert rules.bits[:, 0].tolist() == [1, 2]
     assert rules.table.tolist() == [0.005, 0.1, 1.0]
-    settled = compile_rules(tables, None, 2, settled=True)  # as used by search
+    settled = compile_rules(tables, 2, settled=True)  # as used by search
     assert settled.copies.tolist() == [[0, 0, 0, 1], [1, 0, 0, 0]]

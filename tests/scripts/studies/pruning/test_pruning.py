@@ -53,7 +53,7 @@ def outcome(seed: int, change: float) -> Outcome:
     game, names = FlierCatcher(), tuple(f"observation[{i}]" for i in range(120))
     found = Outcome(Cell("flier_catcher", seed, SETTINGS), names, game.action_names)
     for number, key in enumerate(KEYS):
-        speeds = 8.0, 4.0, 3.0, 2.0 / (1 + number)
+        speeds = 8.0, 4.0, 2.0 / (1 + number)
         found.rows.append(Row("flier_catcher", seed, *key, 100, 0.9, 0.5, 0.1, 0.1, *speeds, *([0.5] * 8)))
         found.returns[key] = np.array([0.9, 1.1, 1.0]) + change * number
         found.influences[key] = found.linked[key] = perfect(game)
