@@ -32,19 +32,20 @@ from mbagent.arguments import (
     planner_settings,
     policy_name,
 )
-from mbagent.checkpoint import SETTINGS, AgentState, space_from_json, space_to_json
+from mbagent.checkpoint import SETTINGS, AgentState
 from mbagent.data import Experience, ExperienceRecorder, TransitionDataset, distinct_rows, warn_of_forgetting
 from mbagent.environments import EnvironmentAlgorithm, step
 from mbagent.explain import Explanation, explain
 from mbagent.exploration.strategies import EXPLORATIONS, Exploration, Watching, catch_up
 from mbagent.files import Target
+from mbagent.models.fit_report import FitReport
 from mbagent.models.neural.connections import PruningConfig, check_fraction, prunable
-from mbagent.models.protocol import FitReport, TransitionModel
+from mbagent.models.protocol import TransitionModel
 from mbagent.models.registry import build_model
 from mbagent.models.reward import LearnedReward
 from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
 from mbagent.rewards import RewardFn, RewardSelector
-from mbagent.spaces import ActionEnumeration, FactoredSpace
+from mbagent.spaces import ActionEnumeration, FactoredSpace, space_from_json, space_to_json
 from mbagent.training_log import check_progress, fit_progress, log_fit, log_rollout
 
 ITERATION_STEPS = 1000

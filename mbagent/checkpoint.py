@@ -14,7 +14,6 @@ from typing import Any, get_args
 import gymnasium as gym
 import numpy as np
 import stable_baselines3
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from mbagent import files
@@ -55,64 +54,6 @@ REQUIRED = (
     "n_updates",
 )
 """Keys that a file's data must contain."""
-
-
-def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
-    """A discrete space as JSON data.
-
-    Raises:
-        TypeError: this type of space is not supported.
-    """
-    if isinstance(space, spaces.Discrete):
-        return {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
-    if isinstance(space, spaces.MultiDiscrete):
-        return {
-            "type": "MultiDiscrete",
-            "nvec": space.nvec.tolist(),
-            "start": space.start.tolist(),
-            "dtype": str(space.dtype),
-        }
-    if isinstance(space, spaces.MultiBinary):
-        n = space.n
-        return {
-            "type": "MultiBinary",
-            "n": int(n) if isinstance(n, int | np.integer) else [int(k) for k in n],
-        }
-    if isinstance(space, spaces.Box):
-        return {
-            "type": "Box",
-            "low": space.low.tolist(),
-            "high": space.high.tolist(),
-            "dtype": str(space.dtype),
-        }
-    if isinstance(space, spaces.Dict):
-        return {"type": "Dict", "spaces": [[key, space_to_json(part)] for key, part in space.spaces.items()]}
-    if isinstance(space, spaces.Tuple):
-        return {"type": "Tuple", "spaces": [space_to_json(part) for part in space.spaces]}
-    raise TypeError(f"The space {space} cannot be written as JSON.")
-
-
-def space_from_json(data: Mapping[str, Any]) -> spaces.Space[Any]:
-    """The space written by ``space_to_json``.
-
-    Raises:
-        ValueError: the type of space is unknown.
-    """
-    kind = data.get("type")
-    if kind == "Discrete":
-        return spaces.Discrete(data["n"], start=data["start"])
-    if kind == "MultiDiscrete":
-        return spaces.MultiDiscrete(np.array(data["nvec"]), start=np.array(data["start"]), dtype=np.dtype(data["dtype"]).type)
-    if kind == "MultiBinary":
-        return spaces.MultiBinary(data["n"] if isinstance(data["n"], int) else tuple(data["n"]))
-    if kind == "Box":
-        dtype = np.dtype(data["dtype"])
-        return spaces.Box(np.array(data["low"], dtype=dtype), np.array(data["high"], dtype=dtype), dtype=dtype.type)
-    if kind == "Dict":
-        return spaces.Dict([(key, space_from_json(part)) for key, part in data["spaces"]])
-    if kind == "Tuple":
-        return spaces.Tuple([space_from_json(part) for part in data["spaces"]])
-    raise ValueError(f"The file names an unknown space {kind!r}; it was written by another program or version.")
 
 
 @dataclass(frozen=True)

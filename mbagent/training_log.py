@@ -10,7 +10,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import safe_mean
 
-from mbagent.models.protocol import FitReport
+from mbagent.models.fit_report import FitReport
 
 
 def check_progress(show: bool) -> None:

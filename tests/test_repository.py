@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 SOURCES = sorted(p for folder in ("mbagent", "envs", "scripts", "tests") for p in (ROOT / folder).rglob("*.py"))
 MAX_FILE_LINES = 600
 MAX_FUNCTION_LINES = 60
-MEDIAN_FUNCTION_LINES = 10
+MEDIAN_FILE_LINES, MEDIAN_FUNCTION_LINES = 200, 10
 MOST_LIBRARY_FILES, MOST_FILES_IN_A_FOLDER = 90, 20
 LIBRARY = [p for p in SOURCES if p.relative_to(ROOT).parts[0] == "mbagent"]
 FORMER_NAMES = {
@@ -167,6 +167,10 @@ def test_names_that_were_replaced_do_not_come_back() -> None:
         with path.open("rb") as file:
             names = {token.string for token in tokenize.tokenize(file.readline) if token.type == tokenize.NAME}
         assert not names & FORMER_NAMES, path
+
+
+def test_files_are_short_in_the_median() -> None:
+    assert statistics.median(len(path.read_text(encoding="utf-8").splitlines()) for path in LIBRARY) <= MEDIAN_FILE_LINES
 
 
 def test_functions_are_short_in_the_median() -> None:

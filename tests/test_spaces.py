@@ -1,3 +1,4 @@
+import json
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,7 @@ from gymnasium.vector.utils import batch_space
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mbagent.spaces import ActionEnumeration, FactoredSpace
+from mbagent.spaces import ActionEnumeration, FactoredSpace, space_from_json, space_to_json
 
 BOOLEAN_BOX = spaces.Box(np.zeros(3, np.bool_), np.ones(3, np.bool_), dtype=np.bool_)  # type: ignore[arg-type]
 ELEMENTARY = st.one_of(
@@ -177,3 +178,19 @@ def test_planes_are_recognised(space: spaces.Space[Any], expected: tuple[int, in
     planes = FactoredSpace(space).planes
     found = None if planes is None else (planes.channels, planes.height, planes.width, planes.channels_last)
     assert found == expected
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Discrete(5, start=-2),
+        spaces.MultiDiscrete([3, 4], start=[1, 0]),
+        spaces.MultiBinary(3),
+        spaces.MultiBinary((3,)),
+        spaces.MultiBinary((2, 3)),
+        spaces.Box(0, 3, (2, 2), dtype=np.uint8),
+        spaces.Dict({"b": spaces.Discrete(2), "a": spaces.Tuple([spaces.MultiBinary(2), spaces.Discrete(3)])}),
+    ],
+)
+def test_spaces_survive_json(space: spaces.Space[Any]) -> None:
+    assert space_from_json(json.loads(json.dumps(space_to_json(space)))) == space

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from mbagent.data import TransitionDataset
 from mbagent.models.base import BaseTransitionModel
-from mbagent.models.protocol import FitReport, Successors, as_keys
+from mbagent.models.fit_report import FitReport
+from mbagent.models.protocol import Successors, as_keys
 from mbagent.planning.planner import Planner
 from mbagent.types import Floats, Ints, Randomness
 from mbagent_envs.random_keys import uniforms

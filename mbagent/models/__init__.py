@@ -1,11 +1,11 @@
 """Transition models behind one protocol: decision graphs, the paper's networks, tables of counts, and simulators."""
 
 from mbagent.models.base import BaseTransitionModel
+from mbagent.models.fit_report import FitReport
 from mbagent.models.neural.model import NeuralTransitionModel
-from mbagent.models.neural.network_pair import NeuralConfig
 from mbagent.models.neural.networks import Conditioner, DensePredictor, FactorCodec, PlanePredictor, Predictor
-from mbagent.models.neural.training import TrainingConfig
-from mbagent.models.protocol import FitReport, Successors, TransitionModel
+from mbagent.models.neural.training import NeuralConfig, TrainingConfig
+from mbagent.models.protocol import Successors, TransitionModel
 from mbagent.models.registry import build_model, register_model
 from mbagent.models.simulator import SimulatorModel
 from mbagent.models.tabular import TabularModel

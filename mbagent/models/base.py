@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.data import TransitionDataset
+from mbagent.models.fit_report import FitReport as FitReport
 from mbagent.models.mdp import ReachableMDP, reachable_mdp
-from mbagent.models.protocol import FitReport as FitReport
 from mbagent.models.protocol import Successors, merge_draws
 from mbagent.types import Actions, Bools, Floats, Randomness, States
 from mbagent_envs.random_keys import derive

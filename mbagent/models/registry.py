@@ -9,9 +9,8 @@ from mbagent.models.base import BaseTransitionModel
 from mbagent.models.dbn import DecisionGraphModel, PlaneGraphModel, channel_cardinalities
 from mbagent.models.neural.forecasts import DirectForecastModel, longest_string
 from mbagent.models.neural.model import NeuralTransitionModel
-from mbagent.models.neural.network_pair import NeuralConfig
 from mbagent.models.neural.networks import PlanePredictor, PlaneStringPredictor
-from mbagent.models.neural.training import TrainingConfig
+from mbagent.models.neural.training import NeuralConfig, TrainingConfig
 from mbagent.models.protocol import TransitionModel
 from mbagent.models.tabular import TabularModel
 from mbagent.spaces import FactoredSpace

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.models.base import BaseTransitionModel, ExactModel
-from mbagent.models.protocol import FitReport, Successors, as_keys
+from mbagent.models.fit_report import FitReport
+from mbagent.models.protocol import Successors, as_keys
 from mbagent.models.systematic_sampling import thin
 from mbagent.types import Actions, Bools, Floats, Randomness, States
 from mbagent_envs.jit import compiled

@@ -11,8 +11,7 @@ from gymnasium import spaces
 
 from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.models.neural.model import NeuralTransitionModel
-from mbagent.models.neural.network_pair import NeuralConfig
-from mbagent.models.neural.training import Trainer, TrainingConfig, examples
+from mbagent.models.neural.training import NeuralConfig, Trainer, TrainingConfig, examples
 from mbagent.models.registry import build_model
 from mbagent.spaces import FactoredSpace
 from mbagent.types import Ints

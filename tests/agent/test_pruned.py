@@ -9,8 +9,7 @@ import pytest
 from mbagent import ModelLearningAgent
 from mbagent.models.neural.connections import PruningConfig
 from mbagent.models.neural.model import NeuralTransitionModel
-from mbagent.models.neural.network_pair import NeuralConfig
-from mbagent.models.neural.training import TrainingConfig
+from mbagent.models.neural.training import NeuralConfig, TrainingConfig
 from mbagent.models.registry import register_model
 from mbagent.spaces import FactoredSpace
 

@@ -7,7 +7,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium import spaces
 from stable_baselines3 import PPO
 
 from mbagent import ModelLearningAgent, checkpoint
@@ -163,22 +162,6 @@ def test_custom_models_are_saved_only_when_registered(tmp_path: Path) -> None:
     named = ModelLearningAgent("MctsPolicy", Corridor(), model="my-model", seed=0)
     named.save(tmp_path / "b.zip")
     assert ModelLearningAgent.load(tmp_path / "b.zip").model_name == "my-model"
-
-
-@pytest.mark.parametrize(
-    "space",
-    [
-        spaces.Discrete(5, start=-2),
-        spaces.MultiDiscrete([3, 4], start=[1, 0]),
-        spaces.MultiBinary(3),
-        spaces.MultiBinary((3,)),
-        spaces.MultiBinary((2, 3)),
-        spaces.Box(0, 3, (2, 2), dtype=np.uint8),
-        spaces.Dict({"b": spaces.Discrete(2), "a": spaces.Tuple([spaces.MultiBinary(2), spaces.Discrete(3)])}),
-    ],
-)
-def test_spaces_survive_json(space: spaces.Space[Any]) -> None:
-    assert checkpoint.space_from_json(json.loads(json.dumps(checkpoint.space_to_json(space)))) == space
 
 
 def test_transitions_can_be_transferred_in_plain_files(agent: ModelLearningAgent, tmp_path: Path) -> None:

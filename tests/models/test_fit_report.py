@@ -6,8 +6,8 @@ from gymnasium import spaces
 
 from mbagent.models.dbn import DecisionGraphModel, LocalGraphModel
 from mbagent.models.dbn.features import action_encoding
+from mbagent.models.fit_report import calibration_error
 from mbagent.models.held_out import following_steps, steps_in_a_row, with_past
-from mbagent.models.protocol import calibration_error
 from mbagent.spaces import FactoredSpace
 from tests.models.helpers import dataset
 

@@ -29,8 +29,8 @@ from mbagent.models.dbn.fitting import ROWS_AT_ONCE, Fitted, Resets, all_redrawn
 from mbagent.models.dbn.joint_events import Pattern, event_chances, excess, factors_of, find_patterns, settled
 from mbagent.models.dbn.mutex import find_groups
 from mbagent.models.dbn.successors import GraphPredictions
+from mbagent.models.fit_report import FitReport, Variable, VariableReport, describe
 from mbagent.models.held_out import PERFECT_LOG_PROB, SOME_ROWS, SOME_TESTS, better, steps_in_a_row, thinned, with_past, within
-from mbagent.models.protocol import FitReport, Variable, VariableReport, describe
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.types import Bools, Floats
 

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from mbagent.data import TransitionDataset
-from mbagent.models.protocol import FitReport, TransitionModel
+from mbagent.models.fit_report import FitReport
+from mbagent.models.protocol import TransitionModel
 
 
 def check_fraction(fraction: float) -> float:

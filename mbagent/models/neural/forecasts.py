@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.models.base import BaseTransitionModel
-from mbagent.models.protocol import LARGEST_NUMBER, FitReport, Successors, TransitionModel, as_keys
+from mbagent.models.fit_report import FitReport
+from mbagent.models.protocol import LARGEST_NUMBER, Successors, TransitionModel, as_keys
 from mbagent.types import Actions, Bools, Floats, Keys, Randomness, States
 from mbagent_envs.random_keys import derive, uniforms
 

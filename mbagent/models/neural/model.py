@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from mbagent.data import TransitionBatch, TransitionDataset
+from mbagent.models.fit_report import FitReport
 from mbagent.models.neural.connections import PruningConfig, check_fraction
 from mbagent.models.neural.export import CompiledBody, as_rows, compiled_body, pack_groups
 from mbagent.models.neural.gibbs import sample_sweeps
@@ -26,7 +27,7 @@ from mbagent.models.neural.sampling import (
 )
 from mbagent.models.neural.training import Examples, Trainer, as_examples, examples, one_thread
 from mbagent.models.neural.truth_tables import BitRules, Pair, compile_rules, find_parents, sample_rules, tabulable, tabulate
-from mbagent.models.protocol import FitReport, Successors, as_keys
+from mbagent.models.protocol import Successors, as_keys
 from mbagent.types import Actions, Bools, Floats, Randomness, States
 
 PrunedAs: TypeAlias = Literal["tables", "matrices"]

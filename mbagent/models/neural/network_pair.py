@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -14,66 +13,9 @@ from torch import nn
 from mbagent.models.base import BaseTransitionModel
 from mbagent.models.neural.connections import Connections
 from mbagent.models.neural.export import pack_layout
-from mbagent.models.neural.networks import Activation, Conditioner, DensePredictor, FactorCodec, Mask
-from mbagent.models.neural.training import TrainingConfig
+from mbagent.models.neural.networks import Conditioner, DensePredictor, FactorCodec
+from mbagent.models.neural.training import NeuralConfig
 from mbagent.models.protocol import LARGEST_NUMBER
-
-
-@dataclass(frozen=True)
-class NeuralConfig:
-    """Architecture and use of the networks.
-
-    Attributes:
-        hidden: sizes of the dense predictor's hidden layers.
-        activation: of all hidden nodes.
-        residual: whether the predictor has a learned path from s_i to s'_i.
-        conditioner: "causal" (ancestral sampling, exact probabilities), "others" (the paper's sweeps), or None (factors
-            independent given state and action).
-        group_size: hidden nodes in each of the conditioner's groups.
-        correction: whether the conditioner's output is added to the predictor's logits.
-        certain: a factor whose most likely value has at least this probability by the predictor is sampled from the predictor;
-            in sweeps the conditioner is evaluated for it only if the random number is extreme (``gibbs.LEEWAY``).
-        dropout: share of hidden nodes zeroed in each training step; without it, networks fit the noise of rare
-            states. None: 0.4, or 0 if the state is a single factor: then states share no features, the network is in effect a
-            table, and dropout only adds noise.
-        sweeps: passes over all factors, with mask "others".
-        real_guess: whether sweeps start from the predictor's probabilities rather than from bits drawn from them.
-        training: see TrainingConfig.
-    """
-
-    hidden: tuple[int, ...] = (128,)
-    activation: Activation = "silu"
-    residual: bool = True
-    conditioner: Mask | None = "causal"
-    group_size: int = 16
-    correction: bool = True
-    certain: float = 0.999
-    dropout: float | None = None
-    sweeps: int = 5
-    real_guess: bool = False
-    training: TrainingConfig = field(default_factory=TrainingConfig)
-
-    def dropout_for(self, n_factors: int) -> float:
-        """The share of dropout for states of ``n_factors`` factors."""
-        if self.dropout is not None:
-            return self.dropout
-        return 0.4 if n_factors > 1 else 0.0
-
-    @classmethod
-    def paper(cls, n_variables: int) -> NeuralConfig:
-        """The networks of section 3, for d = ``n_variables``: 2d + 1 and 2d^2 hidden nodes, sigmoids, squared error."""
-        return cls(
-            hidden=(2 * n_variables + 1,),
-            activation="sigmoid",
-            residual=False,
-            conditioner="others",
-            group_size=2 * n_variables,
-            correction=False,
-            certain=1.0,
-            dropout=0.0,
-            training=TrainingConfig(learning_rate=0.03, weight_decay=0.0, loss="squared"),
-        )
-
 
 BodyFactory: TypeAlias = Callable[[FactorCodec, torch.Generator], nn.Module]
 """Builds a predictor body (see ``networks.Predictor``); all its initial weights must be drawn from the generator."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from mbagent.data import TransitionBatch
 from mbagent.models.neural.connections import Shrinking
-from mbagent.models.neural.networks import Conditioner, Dropout, FactorCodec
+from mbagent.models.neural.networks import Activation, Conditioner, Dropout, FactorCodec, Mask
 from mbagent.types import Progress
 from mbagent_envs.random_keys import hash_rows
 
@@ -59,6 +59,62 @@ class TrainingConfig:
     loss: Loss = "cross_entropy"
     negligible: float = 1e-3
     online_learning_rate: float = 3e-3
+
+
+@dataclass(frozen=True)
+class NeuralConfig:
+    """Architecture and use of the networks.
+
+    Attributes:
+        hidden: sizes of the dense predictor's hidden layers.
+        activation: of all hidden nodes.
+        residual: whether the predictor has a learned path from s_i to s'_i.
+        conditioner: "causal" (ancestral sampling, exact probabilities), "others" (the paper's sweeps), or None (factors
+            independent given state and action).
+        group_size: hidden nodes in each of the conditioner's groups.
+        correction: whether the conditioner's output is added to the predictor's logits.
+        certain: a factor whose most likely value has at least this probability by the predictor is sampled from the predictor;
+            in sweeps the conditioner is evaluated for it only if the random number is extreme (``gibbs.LEEWAY``).
+        dropout: share of hidden nodes zeroed in each training step; without it, networks fit the noise of rare
+            states. None: 0.4, or 0 if the state is a single factor: then states share no features, the network is in effect a
+            table, and dropout only adds noise.
+        sweeps: passes over all factors, with mask "others".
+        real_guess: whether sweeps start from the predictor's probabilities rather than from bits drawn from them.
+        training: see TrainingConfig.
+    """
+
+    hidden: tuple[int, ...] = (128,)
+    activation: Activation = "silu"
+    residual: bool = True
+    conditioner: Mask | None = "causal"
+    group_size: int = 16
+    correction: bool = True
+    certain: float = 0.999
+    dropout: float | None = None
+    sweeps: int = 5
+    real_guess: bool = False
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+
+    def dropout_for(self, n_factors: int) -> float:
+        """The share of dropout for states of ``n_factors`` factors."""
+        if self.dropout is not None:
+            return self.dropout
+        return 0.4 if n_factors > 1 else 0.0
+
+    @classmethod
+    def paper(cls, n_variables: int) -> NeuralConfig:
+        """The networks of section 3, for d = ``n_variables``: 2d + 1 and 2d^2 hidden nodes, sigmoids, squared error."""
+        return cls(
+            hidden=(2 * n_variables + 1,),
+            activation="sigmoid",
+            residual=False,
+            conditioner="others",
+            group_size=2 * n_variables,
+            correction=False,
+            certain=1.0,
+            dropout=0.0,
+            training=TrainingConfig(learning_rate=0.03, weight_decay=0.0, loss="squared"),
+        )
 
 
 @dataclass(frozen=True)

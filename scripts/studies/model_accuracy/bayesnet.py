@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from mbagent.data import TransitionDataset
 from mbagent.models.base import BaseTransitionModel
-from mbagent.models.protocol import FitReport, as_keys
+from mbagent.models.fit_report import FitReport
+from mbagent.models.protocol import as_keys
 from mbagent.models.registry import register_model
 from mbagent.spaces import FactoredSpace
 from mbagent.types import Actions, Bools, Floats, Randomness, States

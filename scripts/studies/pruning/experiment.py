@@ -11,8 +11,8 @@ import mbagent
 from harness import Result, check_at_least
 from mbagent.models.neural.connections import PruningConfig
 from mbagent.models.neural.model import NeuralTransitionModel
-from mbagent.models.neural.network_pair import NeuralConfig
 from mbagent.models.neural.pruning import Influence, dependent_groups, influence, modules
+from mbagent.models.neural.training import NeuralConfig
 from mbagent.spaces import ActionEnumeration, FactoredSpace
 from mbagent.types import Floats
 from studies.pruning.measures import excess, marginal_error, measure_others, measure_speeds, unseen_play

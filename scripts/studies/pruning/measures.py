@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from mbagent.models.neural.model import NeuralTransitionModel, PrunedAs
-from mbagent.models.neural.network_pair import NeuralConfig
+from mbagent.models.neural.training import NeuralConfig
 from mbagent.models.simulator import SimulatorModel
 from mbagent_envs.random_keys import derive
 from studies.planning.sampling import EVERYTHING, microseconds, using

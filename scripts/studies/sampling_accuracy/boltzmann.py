@@ -22,9 +22,10 @@ from torch.nn import functional
 
 from mbagent.data import TransitionDataset
 from mbagent.models.base import BaseTransitionModel
+from mbagent.models.fit_report import FitReport
 from mbagent.models.neural.networks import FactorCodec, uniform
 from mbagent.models.neural.training import Examples, batches, examples, one_cycle, one_thread
-from mbagent.models.protocol import FitReport, as_keys
+from mbagent.models.protocol import as_keys
 from mbagent.types import Actions, Bools, Floats, Randomness, States
 from mbagent_envs.random_keys import derive, uniforms
 

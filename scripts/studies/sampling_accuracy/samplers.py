@@ -8,8 +8,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from mbagent.models.neural.model import NeuralTransitionModel
-from mbagent.models.neural.network_pair import NeuralConfig
-from mbagent.models.neural.training import TrainingConfig
+from mbagent.models.neural.training import NeuralConfig, TrainingConfig
 from mbagent.models.protocol import TransitionModel
 from mbagent.models.tabular import TabularModel
 from mbagent_envs.random_keys import derive

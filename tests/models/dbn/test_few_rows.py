@@ -5,7 +5,7 @@ import pytest
 from gymnasium import spaces
 
 from mbagent.models.dbn import DecisionGraphModel, LocalGraphModel
-from mbagent.models.protocol import FitReport
+from mbagent.models.fit_report import FitReport
 from mbagent.spaces import FactoredSpace
 from mbagent_envs.random_keys import derive
 from tests.models.helpers import dataset

@@ -7,9 +7,8 @@ import torch
 from mbagent.data import TransitionDataset
 from mbagent.models.neural.connections import Connections, PruningConfig, Shrinking
 from mbagent.models.neural.model import NeuralTransitionModel
-from mbagent.models.neural.network_pair import NeuralConfig
 from mbagent.models.neural.networks import PlanePredictor
-from mbagent.models.neural.training import TrainingConfig
+from mbagent.models.neural.training import NeuralConfig, TrainingConfig
 from mbagent.spaces import PlaneLayout
 from tests.models.helpers import dataset
 

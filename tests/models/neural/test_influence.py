@@ -3,10 +3,9 @@
 import numpy as np
 
 from mbagent.models.neural.model import NeuralTransitionModel
-from mbagent.models.neural.network_pair import NeuralConfig
 from mbagent.models.neural.networks import DensePredictor
 from mbagent.models.neural.pruning import dependent_groups, influence, modules
-from mbagent.models.neural.training import examples
+from mbagent.models.neural.training import NeuralConfig, examples
 from mbagent.models.neural.truth_tables import Pair, find_parents
 from tests.models.helpers import dataset
 

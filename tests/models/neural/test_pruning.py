@@ -6,10 +6,9 @@ import torch
 
 from mbagent.data import TransitionDataset
 from mbagent.models.neural.model import NeuralTransitionModel
-from mbagent.models.neural.network_pair import NeuralConfig
 from mbagent.models.neural.networks import Affine, DensePredictor
 from mbagent.models.neural.pruning import Judge, influence, trim_layer
-from mbagent.models.neural.training import Examples, TrainingConfig, examples
+from mbagent.models.neural.training import Examples, NeuralConfig, TrainingConfig, examples
 from tests.models.helpers import dataset
 from tests.models.neural.test_connections import N_BITS, fitted, shifted
 

@@ -42,8 +42,8 @@ from mbagent.models.dbn.planes.features import (
 from mbagent.models.dbn.planes.invariants import NO_INVARIANTS, Invariants, all_kept, find_invariants, n_combinations
 from mbagent.models.dbn.planes.large_data import PlaneTable, channel_layout, refine
 from mbagent.models.dbn.score import Search
+from mbagent.models.fit_report import FitReport, Variable
 from mbagent.models.held_out import PERFECT_LOG_PROB, SOME_ROWS, SOME_TESTS, better, thinned
-from mbagent.models.protocol import FitReport, Variable
 from mbagent.spaces import FactoredSpace, PlaneLayout
 from mbagent.types import Bools, Floats, Ints
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from harness import joined, write_csv
-from mbagent.models.neural.network_pair import NeuralConfig
-from mbagent.models.neural.training import TrainingConfig
+from mbagent.models.neural.training import NeuralConfig, TrainingConfig
 from sampling_accuracy import main
 from studies.sampling_accuracy import experiment, samplers
 from studies.sampling_accuracy.boltzmann import BoltzmannConfig

@@ -3,8 +3,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from mbagent.planning import fitted_value_iteration
-from mbagent.planning.fitted_value_iteration import PAIRED, RIDGE, PairRegression
+from mbagent.planning import pair_regression
+from mbagent.planning.pair_regression import PAIRED, RIDGE, PairRegression
 from mbagent.planning.value_iteration import leaf_value
 
 CARDINALITIES = (2, 3, 5, 2)
@@ -30,7 +30,7 @@ def columns(states: np.ndarray, like: np.ndarray, paired: bool) -> np.ndarray:
 @pytest.mark.parametrize("n_states", [6, 80])
 def test_it_is_ridge_regression_with_a_free_mean(n_states: int, paired: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not paired:
-        monkeypatch.setattr(fitted_value_iteration, "MOST_PAIRS", 0)
+        monkeypatch.setattr(pair_regression, "MOST_PAIRS", 0)
     states, others = drawn(n_states, 0), drawn(50, 1)
     values = np.random.default_rng(2).normal(size=n_states)
     regression = PairRegression(states, CARDINALITIES, others, -100.0, 100.0)
