@@ -42,6 +42,11 @@ def vectorised(function: _F) -> _F:
 def _with_cache(dispatcher: Any, function: _F) -> _F:
     """The dispatcher, with a cache on disk that depends on the hash of the sources."""
     if hasattr(dispatcher, "enable_caching"):  # a plain function if NUMBA_DISABLE_JIT is set
+        # Numba would compile a function again for each constant passed to it, and for the first value of a loop's variable.
+        resolve, plain = dispatcher.get_call_template, cast("Any", types.unliteral)
+        dispatcher.get_call_template = lambda args, kws: resolve(
+            [plain(kind) for kind in args], {name: plain(kind) for name, kind in kws.items()}
+        )
         try:
             dispatcher._cache = _Cache(function)
         except RuntimeError as error:  # numba found no writable folder

@@ -96,3 +96,23 @@ def test_damaged_files_raise_no_error(double: Callable[[Any], Any], tmp_path: Pa
     index.write_bytes(b"")
     with pytest.warns(RuntimeWarning, match="NUMBA_CACHE_DIR"):
         assert double(0.5) == 1.0
+
+
+@jit.compiled
+def _next(number: int) -> int:
+    return number + 1
+
+
+@jit.compiled
+def _sum_of_next(n: int) -> int:
+    total = 0
+    for _ in range(n):
+        total += _next(total) + _next(3)
+    return total
+
+
+@pytest.mark.skipif(not hasattr(_next, "signatures"), reason="compilation is disabled")
+def test_a_function_is_not_compiled_again_for_constants() -> None:
+    assert _sum_of_next(2) == 15
+    dispatcher: Any = _next
+    assert len(dispatcher.signatures) == 1

@@ -84,7 +84,7 @@ def summary_rows(outcomes: Sequence[Outcome]) -> list[dict[str, str | int | floa
 
 def markdown_table(paths: Sequence[Path]) -> str:
     """The README's table, from files of ``summary_rows``."""
-    titles = ["", "pruned", "connections", "return", "change", "nats lost", "µs", "precision", "recall", "modules"]
+    titles = ["", "pruned", "connections", "return", "change", "nats lost", "speed", "precision", "recall", "modules"]
     lines = []
     for path in paths:
         with path.open(encoding="utf-8", newline="") as file:
@@ -93,7 +93,7 @@ def markdown_table(paths: Sequence[Path]) -> str:
                 change = f"{format_number(cell['change'], 4)} ± {cell['half_width']:.4f}" if fraction else ""
                 shown = [find_case(row["game"]).title, f"{fraction:.0%}, {row['way']}" if fraction else "no"]
                 shown += [format_number(cell["connections"], 0), format_number(cell["returned"], 3), change]
-                shown += [format_number(cell[name], digits) for name, digits in (("log_likelihood", 4), ("used", 2))]
+                shown += [format_number(cell[name], digits) for name, digits in (("log_likelihood", 4), ("speed_up", 1))]
                 shown += [format_number(cell[name], 2) for name in ("precision", "recall", "modules")]
                 lines.append(shown)
     return Table(titles, lines).markdown(names=2)
