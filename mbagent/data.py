@@ -536,8 +536,8 @@ class ExperienceRecorder:
     def warn_of_reused_arrays(self) -> None:
         """Warns, once, if the last observations of episodes appear to be overwritten by the following resets.
 
-        This is assumed if each of them equals the next episode's first observation, and this is improbable by chance, given
-        how often these start states are observed.
+        This is assumed if each of them equals the next episode's first observation and the frequency of these start states
+        makes that unlikely by chance.
         """
         if not self._ends_at_starts or len(self._starts) < 2 or isinstance(self._space.space, spaces.Discrete):
             return  # numbers cannot be overwritten

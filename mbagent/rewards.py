@@ -277,7 +277,7 @@ class RewardSelector:
         return None
 
     def _test(self, reward: CallableReward) -> None:
-        """Tests a reward function on observed transitions, or else on start states or the space's first observation."""
+        """Tests a reward function on observed transitions, else start states, else the space's first observation."""
         rows = self._transitions.rows()
         if len(rows):
             picked = rows.select(np.linspace(0, len(rows) - 1, min(_TEST_ROWS, len(rows))).astype(np.int64))

@@ -32,7 +32,7 @@ def check_progress(show: bool) -> None:
 
 @contextmanager
 def fit_progress(show: bool) -> Iterator[Callable[[float], None] | None]:
-    """A function that displays the completed share of a fit as a bar; None without ``show``, see ``check_progress``."""
+    """Yields a function that shows a fit's completed share as a bar, None if not ``show``; see ``check_progress``."""
     if not show:
         yield None
         return

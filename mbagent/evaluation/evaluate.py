@@ -34,7 +34,7 @@ class Evaluation:
     """Episodes played by one policy.
 
     Attributes:
-        returns: undiscounted return of each episode, float64 [episodes], by name of the goal.
+        returns: goal name to undiscounted return of each episode, float64 [episodes].
         seconds: wall time spent in the policy.
         decisions: number of decisions of the policy.
     """

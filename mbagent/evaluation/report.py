@@ -49,7 +49,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Card:
-    """One box of a page: a title, a figure, a table, notes and code lines, all but the title optional.
+    """One box of a page: a title, a figure, a table, notes and code lines, all optional.
 
     Attributes:
         title: title of the box.

@@ -209,7 +209,7 @@ def _improve(table: VisitArrays, work: int, at: int, upwards: bool) -> tuple[int
 
 @compiled
 def _choose(table: VisitArrays, nodes: Ints, noise: Floats, at: int, upwards: bool, actions: Actions) -> tuple[int, bool]:
-    """Fills ``actions`` [B], see VisitTable.choose; each counts as tried for later rows. Returns as _improve does."""
+    """Fills ``actions`` [B], see VisitTable.choose; later rows count each as tried. Returns what _improve does."""
     at, upwards = _improve(table, WORK, at, upwards)
     for b in range(len(nodes)):
         best = -np.inf
@@ -414,9 +414,9 @@ class DirectedExploration:
             self._kept = None
 
     def _reconsider(self) -> None:
-        """Chooses the finest of three representations of states that has few of them.
+        """Chooses the finest of three state representations with few distinct states.
 
-        These are all factors; the factors that actions reach directly or through others; and what depends on actions directly.
+        Finest first: all factors; the factors that actions reach directly or through others; what depends on actions directly.
         """
         if self._kept is None or (self.view is None and self.directed):
             return

@@ -33,7 +33,7 @@ def thinned(rows: TransitionBatch, most: int) -> TransitionBatch:
 
 
 def within(data: TransitionDataset, most: int) -> TransitionDataset:
-    """The dataset, or evenly spaced transitions of it, such that transitions times factors are at most ``most``."""
+    """The dataset, or evenly spaced transitions of it, at least one, so that transitions times factors is at most ``most``."""
     n = max(1, most // max(1, len(data.cardinalities)))
     if len(data) <= n:
         return data

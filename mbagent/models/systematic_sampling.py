@@ -26,7 +26,7 @@ from mbagent_envs.random_keys import derive, derive_one, uniform_at, uniforms
 
 @inlined
 def largest(probs: Floats, b: int, i: int, n: int) -> int:
-    """The most probable of the ``n`` values of factor i in row b; the lowest one of equal ones."""
+    """The most probable of the ``n`` values of factor i in row b; the lowest one if tied."""
     best = 0
     for k in range(1, n):
         if probs[b, i, k] > probs[b, i, best]:

@@ -119,7 +119,7 @@ class ValueIterationPlanner:
         return Plan(best_actions(scores), values, visits)
 
     def _warn_of_errors(self, bounds: Floats | None, nodes: Ints, scores: Floats, values: Floats) -> None:
-        """Warns, once for each goal, if rare outcomes that were merged with others could change the choice of an action."""
+        """Warns, once for each goal, if the merging of rare outcomes could change the choice of an action."""
         if self._warned or bounds is None or not undecided(scores, values, bounds[nodes]).any():
             return
         self._warned, settings = True, self.settings

@@ -154,7 +154,7 @@ def solve(graph: StateGraph, goal: Reward, gamma: float, n_groups: int = 1, leaf
 
 
 def settle(graph: StateGraph, values: Values, gamma: float, max_sweeps: int = MAX_SWEEPS, only: Bools | None = None) -> None:
-    """Value iteration that starts from the given values, in place.
+    """In-place value iteration that starts from the given values.
 
     Gauss-Seidel updates, last node first: without cycles, one sweep suffices if every node was added before its successors.
 

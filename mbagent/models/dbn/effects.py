@@ -333,9 +333,9 @@ def _change_questions(variable: int, cardinality: int, observed: Observed) -> li
 
 
 def _sum_questions(effect: Effect, variable: int, cardinality: int, n_actions: int, observed: Observed) -> list[Question]:
-    """Questions about each deviation from the sum within the bounds, and for either bound, given the sum.
+    """One question per deviation from the sum, inside the bounds; one per bound, conditioned on the sum.
 
-    For the latter, sums that were never observed are replaced by the nearest observed one.
+    For the bounds, a sum that was never observed is replaced by the nearest observed one.
     """
     last, every = cardinality - 1, np.arange(n_actions * cardinality)
     sums, here = (

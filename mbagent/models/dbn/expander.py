@@ -168,7 +168,7 @@ def graph_outcomes(
 
 @compiled
 def _end(g: AffectedIndex, work: GraphWork, action_class: int, n_open: int, grid: Grid) -> None:
-    """Draws whether the episode ends, for each particle given its next state so far."""
+    """Draws for each particle whether the episode ends, given its next state so far."""
     p, joint, following, opened, end = work.p, work.joint, work.following, work.opened, len(g.variables) - 2
     n_main, n_strata = p.state[MAIN], p.state[STRATA]
     for j in range(n_main + n_strata):

@@ -201,9 +201,9 @@ def is_lone_bit(layout: Layout) -> Bools:
 
 
 def variable_values(layout: Layout, states: Factors) -> Factors:
-    """Value of each variable but the last two in states [B, F], [B, U - 2], in the smallest dtype.
+    """Values [B, U - 2] of all variables but the last two in states [B, F], in the smallest dtype.
 
-    A group's value is the number of its first bit that is on.
+    A group's value is the index of its first bit that is on.
     """
     values = np.empty((len(states), len(layout.outputs) - 2), dtype=np.min_scalar_type(int(layout.outputs.max()) - 1))
     for variable in range(values.shape[1]):
@@ -259,11 +259,10 @@ class Question:
     Attributes:
         variable: number of the variable.
         values: the predicted next value for each pair, int64 [P].
-        pairs: action class times cardinality plus current value of each pair, int64 [P], ascending.
+        pairs: action class * cardinality + current value, for each pair, int64 [P], ascending.
         target: the rows.
         context: initial context of each pair, int64 [P]: one of its own, unless several pairs share a context.
-        operand: features of the operand that replaces the action in the pairs, one for each of its values, int64; None for the
-            action.
+        operand: features of the operand that replaces the action in the pairs, one per operand value, int64; None if none does.
     """
 
     variable: int

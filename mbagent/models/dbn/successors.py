@@ -256,10 +256,10 @@ class WholeWork(NamedTuple):
     Attributes:
         on: features, bool [D].
         values: current values of the variables, int64 [U].
-        rates: their distributions, [sum of cardinalities].
-        actions: numbers of all actions, int64 [A].
+        rates: next-value distributions, [sum of cardinalities].
+        actions: indices of all actions, int64 [A].
         states: the current state, int64 [1, F].
-        reset: number of the variable for resets, int64 [1].
+        reset: index of the reset variable, int64 [1].
     """
 
     on: Bools

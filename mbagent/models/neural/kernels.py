@@ -136,7 +136,7 @@ def add_columns(table: Floats32, g: int, columns: Ints, n_columns: int, sums: Fl
 
 @vectorised
 def add_scaled(table: Floats32, g: int, column: int, scale: np.float32, sums: Floats32, row: int) -> None:
-    """Adds to ``sums[row]`` [G] the weights of group g for one column of ``table`` [g, columns, G], times ``scale``."""
+    """Adds ``scale * table[g, column]`` to ``sums[row]`` [G]; ``table`` [g, columns, G] holds the groups' weights."""
     for h in range(table.shape[2]):
         sums[row, h] += scale * table[g, column, h]
 
@@ -430,7 +430,7 @@ def _dense_block(
     after: Floats32,
     columns: Floats32,
 ) -> None:
-    """The output columns [R, C] of rows from ``first`` on; ``active``, ``now`` and ``after`` [R, H] are work space."""
+    """Fills ``columns`` [R, C] for rows from ``first`` on; ``now`` and ``after`` [R, H], ``active`` are work space."""
     depth = len(dense.sizes)
     for r in range(n_rows):
         b = first + r

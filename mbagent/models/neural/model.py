@@ -37,8 +37,8 @@ class NeuralTransitionModel(NetworkPair):
     """A predictor network, alone or with a conditioner network. Arguments are those of NetworkPair.
 
     Attributes:
-        pruned_as: representation from which a pruned model of bits is sampled: truth "tables" if all bits have few remaining
-            inputs, or dense "matrices", as before pruning.
+        pruned_as: what a pruned model of bits is sampled from: truth "tables", if all bits have few inputs left, or the dense
+            "matrices" used before pruning.
     """
 
     pruned_as: PrunedAs = "tables"

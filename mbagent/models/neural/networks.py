@@ -170,7 +170,7 @@ class Dropout(nn.Module):
     ``nn.Dropout`` would draw from the process-wide generator. The trainer sets and removes ``generator``.
 
     Args:
-        share: share of the inputs that are zeroed, 0 ... 1, to the nearest 1/256; the others are scaled up to keep the mean.
+        share: fraction of inputs zeroed, in [0, 1), rounded to 1/256; the others are scaled up to keep the mean.
     """
 
     def __init__(self, share: float) -> None:

@@ -137,7 +137,7 @@ def modules(found: Influence) -> list[VariableGroup]:
 
 
 def dependent_groups(found: Influence) -> list[VariableGroup]:
-    """Groups of variables that depend on each other given state and action, by the conditioner; largest first."""
+    """Groups of variables that the conditioner links to each other given state and action; largest first."""
     return _modules(found, found.others > 0.0)
 
 
@@ -244,7 +244,7 @@ class Layers:
         return self._left() < before
 
     def trim_past(self, i: int, paths: Tensor, weight: Tensor, judge: Judge) -> bool:
-        """Removes all paths from input i to column i at once, direct ones and those through nodes, which may cancel each other.
+        """Removes all paths from input i to column i, direct or through nodes, at once, as they may cancel each other.
 
         Args:
             i: index of the input and of the column.

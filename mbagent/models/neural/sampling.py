@@ -384,7 +384,7 @@ def causal_successors(
 ) -> Successors:
     """Successors under a compiled causal conditioner.
 
-    Arguments are those of ``sample_causal``, and ``n_samples`` and ``seed`` of ``independent_successors``.
+    Arguments as in ``sample_causal``; ``n_samples`` and ``seed`` as in ``independent_successors``.
     """
     key, offset = start(seed)
     step = rows_at_once(n_samples, len(layout.outputs))

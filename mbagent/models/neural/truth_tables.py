@@ -123,7 +123,7 @@ def paths(pair: Pair) -> NDArray[np.bool_]:
 
 @torch.no_grad()
 def find_parents(pair: Pair, rows: Examples) -> Marks:
-    """Parents of each outcome bit among the bits of state and outcome: int8 [O, F + O], PARENT or the bit's fixed value."""
+    """Parents of each outcome bit among state and outcome bits: int8 [O, F + O], PARENT or the non-parent's fixed value."""
     codec, rows = pair.predictor.codec, rows.spread(TABLE_ROWS)
     columns = torch.cat((codec.inputs(rows.states, rows.actions), codec.targets(rows.outcomes)), dim=1)
     usual, reach, n_bits = (columns.mean(dim=0) > 0.5).float(), paths(pair), codec.n_state_columns
@@ -359,7 +359,7 @@ def rules_work(k: BitRules, n_grid: int) -> RulesWork:
 
 @inlined
 def _by_outcome(q: int, place: int, weight: int, v: int, end: int, parents: Ints, base: Ints, slot: Ints, factors: Ints) -> int:
-    """Adds the parents ``v`` to ``end``, with the values of particle q, to the index ``place``, starting at stride ``weight``."""
+    """Adds the values of parents ``v:end`` in particle q to the index ``place``, the first one with stride ``weight``."""
     while v < end:
         value = base[parents[v]]
         if value < 0:

@@ -58,12 +58,12 @@ NEXT_RADIUS = 2
 
 
 def relative_features(cardinalities: Sequence[int], parts: Sequence[int], reach: Reach) -> Ints:
-    """All relative features, int64 [D, 7]; see above.
+    """All relative features, int64 [D, 7]; see CELL.
 
     Args:
         cardinalities: number of values of each channel's cells, length C.
         parts: number of values of each action component.
-        reach: of neighbourhoods.
+        reach: see ``Reach``.
     """
     near = range(-reach.radius, reach.radius + 1)
     offsets = list(itertools.product(near, near))
