@@ -35,7 +35,7 @@ _FORMERLY = {
     "models.held_out": "models.memory",
     "models.mdp": "models.reachable models.state_graph",
     "models.model_error": "models.trust",
-    "models.overloads": "models.compiled_model",
+    "models.kernel": "models.compiled_model models.overloads",
     "models.registry": "models.factory",
     "models.reward": "learned_reward models.reward_kernel",
     "models.reward_changes": "reward_changes",

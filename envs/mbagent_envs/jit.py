@@ -22,11 +22,12 @@ from numba.extending import intrinsic
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _T = TypeVar("_T")
+_njit = cast("Any", numba.njit)  # the stubs lack an option: a wrapper that nothing here needs is not compiled
 
 
 def compiled(function: _F) -> _F:
     """Compile a function of numbers and arrays; the uncompiled function is available as ``function.py_func``."""
-    return _with_cache(numba.njit(nogil=True)(function), function)
+    return _with_cache(_njit(nogil=True, no_cfunc_wrapper=True)(function), function)
 
 
 def vectorised(function: _F) -> _F:
@@ -36,7 +37,8 @@ def vectorised(function: _F) -> _F:
     may be added without intermediate rounding; and division by zero raises no error. Arrays must have a contiguous type, which
     those unpacked by ``a, b = np.empty((2, n))`` do not have.
     """
-    return _with_cache(numba.njit(nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})(function), function)
+    fast = {"reassoc", "contract", "nsz"}
+    return _with_cache(_njit(nogil=True, no_cfunc_wrapper=True, error_model="numpy", fastmath=fast)(function), function)
 
 
 def _with_cache(dispatcher: Any, function: _F) -> _F:

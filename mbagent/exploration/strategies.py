@@ -6,6 +6,7 @@ The directed strategy counts visits of (state, action) pairs and runs value iter
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -16,6 +17,7 @@ from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.exploration.controllability import StateAbstraction, find_controllable, find_reached
 from mbagent.types import Actions, Bools, Floats, Ints, States
 from mbagent_envs.jit import compiled
+from mbagent_envs.structs import Struct
 
 DISCOUNT = 0.99
 """Discount of a step for the values of states under the bonus."""
@@ -33,7 +35,7 @@ START_NODE = 0
 """The node that represents the start of a new episode."""
 
 
-class VisitArrays(NamedTuple):
+class VisitArrays(Struct):
     """Arrays of a VisitTable for compiled code, with spare capacity; N nodes and M outcomes are in use.
 
     Attributes:
@@ -107,8 +109,9 @@ class VisitTable:
         """Reserves memory for at least ``n_nodes`` nodes and ``n_outcomes`` outcomes."""
         old = self._arrays
         self._arrays = _room(self.n_actions, max(n_nodes, len(old.worth)), max(n_outcomes, len(old.target)))
-        for before, after in zip(old, self._arrays, strict=True):
-            after[: len(before)] = before
+        for field in fields(old):
+            before: Ints = getattr(old, field.name)
+            getattr(self._arrays, field.name)[: len(before)] = before
 
     def counts(self, states: States) -> Ints:
         """Visit count of each action in states [B, F], int64 [B, A]."""

@@ -6,18 +6,19 @@ edge leads from one group to another, so that the plan for one observation canno
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.overloads import CompiledModel, Outcomes, outcomes, work_for
+from mbagent.models.kernel import CompiledModel, Kernel, Outcomes, work_for
 from mbagent.models.protocol import Successors, TransitionModel
 from mbagent.models.systematic_sampling import start as grid_of
 from mbagent.types import Bools, Floats, Ints, Keys, States
-from mbagent_envs.jit import borrowed, compiled
+from mbagent_envs.jit import compiled, inlined
 from mbagent_envs.random_keys import derive, mix
+from mbagent_envs.structs import Struct
 
 FEWEST_SLOTS = 1024
 """Number of slots of the smallest hash table."""
@@ -26,7 +27,7 @@ NODES_AT_ONCE = 16_384
 """Number of successors for which memory is reserved at once, unless one state may have more; 16 bytes per node and action."""
 
 
-class GraphArrays(NamedTuple):
+class GraphArrays(Struct):
     """The arrays of a graph for compiled kernels, with spare capacity; N nodes and M edges are in use.
 
     Attributes:
@@ -96,12 +97,12 @@ def add_edge(graph: GraphArrays, source: int, action: int, state: Ints, terminat
     return target
 
 
-@compiled
+@inlined
 def expand_with(
-    kernel: Any, work: Any, graph: GraphArrays, node: int, n_samples: int, key: np.uint64, offset: float, out: Outcomes
+    kernel: Kernel, work: Any, graph: GraphArrays, node: int, n_samples: int, key: np.uint64, offset: float, out: Outcomes
 ) -> None:
     """Appends all successors of a node, as listed by a kernel."""
-    outcomes(kernel, work, graph.states[node], n_samples, key, offset, out)
+    kernel.outcomes(kernel, work, graph.states[node], n_samples, key, offset, out)
     i = 0
     for action in range(len(out.counts)):
         graph.left_out[node, action] = out.left_out[action]
@@ -111,13 +112,11 @@ def expand_with(
     graph.expanded[node] = True
 
 
-@compiled
 def most_outcomes(n_actions: int, n_samples: int) -> int:
-    """Maximum number of outcomes of a state; see ``overloads.outcomes``."""
+    """Maximum number of outcomes of a state; see ``kernel.outcomes``."""
     return 2 * n_actions * max(n_samples, 2)
 
 
-@compiled
 def room_for_outcomes(n_actions: int, n_factors: int, n_samples: int) -> Outcomes:
     """Arrays for all outcomes of a state."""
     most = most_outcomes(n_actions, n_samples)
@@ -131,18 +130,17 @@ def room_for_outcomes(n_actions: int, n_factors: int, n_samples: int) -> Outcome
 
 
 @compiled
-def _expand_all(kernel: Any, graph: GraphArrays, nodes: Ints, n_samples: int, key: np.uint64, offset: float) -> int:
+def _expand_all(
+    kernel: Kernel, work: Any, out: Outcomes, graph: GraphArrays, nodes: Ints, n_samples: int, key: np.uint64, offset: float
+) -> int:
     """Expands nodes [B] as long as the arrays have capacity; returns the number of expanded nodes."""
-    n_actions, most = graph.counts.shape[1], most_outcomes(graph.counts.shape[1], n_samples)
-    made = work_for(kernel, n_samples), room_for_outcomes(n_actions, graph.states.shape[1], n_samples)
-    work_out, kernel, graph = borrowed(made), borrowed(kernel), borrowed(graph)
-    done = 0
+    most, done = len(out.probabilities), 0
     for node in nodes:
         if graph.sizes[0] + most > len(graph.states) or graph.sizes[1] + most > len(graph.sources):
             break
-        expand_with(kernel, work_out[0], graph, node, n_samples, key, offset, work_out[1])
+        expand_with(kernel, work, graph, node, n_samples, key, offset, out)
         done += 1
-    return done + 0 * len(made[1].counts)  # the borrowed arrays must live until here
+    return done
 
 
 @compiled
@@ -216,6 +214,7 @@ class StateGraph:
         """See the class."""
         self.model = model
         self.kernel = model.kernel() if isinstance(model, CompiledModel) else None
+        self._work: tuple[int, Any, Outcomes] | None = None
         n_factors, n_actions = len(model.cardinalities), model.n_actions
         none = np.zeros(0, dtype=np.int64)
         table, flags = np.zeros((0, n_actions), dtype=np.int64), np.zeros(0, dtype=np.bool_)
@@ -268,11 +267,11 @@ class StateGraph:
             old = len(getattr(arrays, fields[0]))
             if used + extra > old:
                 size = max(used + extra, 2 * old, 1024)
-                arrays = arrays._replace(**{name: _longer(getattr(arrays, name), used, size) for name in fields})
+                arrays = replace(arrays, **{name: _longer(getattr(arrays, name), used, size) for name in fields})
         if 2 * len(arrays.tags) > len(arrays.slots):
             slots = np.full(1 << (2 * len(arrays.tags) - 1).bit_length(), -1, dtype=np.int64)
             _place_all(arrays.tags[: len(self)], slots)
-            arrays = arrays._replace(slots=slots)
+            arrays = replace(arrays, slots=slots)
         self.arrays = arrays
 
     def add(self, states: States, groups: Ints) -> Ints:
@@ -297,16 +296,24 @@ class StateGraph:
         size = len(self)
         if self.kernel is not None:
             key, offset = grid_of(seed)
+            work, out = self.work_space(n_samples)
             of_one = most_outcomes(self.model.n_actions, n_samples)
             while len(nodes):
                 most = of_one * max(1, min(len(nodes), NODES_AT_ONCE // of_one))
                 self.reserve(most, most)
-                nodes = nodes[_expand_all(self.kernel, self.arrays, nodes, n_samples, key, offset) :]
+                nodes = nodes[_expand_all(self.kernel, work, out, self.arrays, nodes, n_samples, key, offset) :]
         elif len(nodes):
             n_actions = self.model.n_actions
             sources, actions = np.repeat(nodes, n_actions), np.tile(np.arange(n_actions), len(nodes))
             self._append(nodes, self.model.successors(self.states[sources], actions, n_samples, seed))
         return np.arange(size, len(self), dtype=np.int64)
+
+    def work_space(self, n_samples: int) -> tuple[Any, Outcomes]:
+        """Work arrays of the kernel and arrays for the outcomes of a state."""
+        if self._work is None or self._work[0] != n_samples:
+            out = room_for_outcomes(self.model.n_actions, len(self.model.cardinalities), n_samples)
+            self._work = n_samples, work_for(self.kernel, n_samples), out
+        return self._work[1:]
 
     def _append(self, nodes: Ints, found: Successors) -> None:
         self.reserve(len(found.states), len(found.states))

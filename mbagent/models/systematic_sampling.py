@@ -13,15 +13,18 @@ Shapes: n grid points, 2 n slots (main particles first, strata from slot n on), 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
+from mbagent.models.kernel import Outcomes
 from mbagent.models.protocol import Successors
 from mbagent.types import Bools, Floats, Ints
 from mbagent_envs.jit import compiled, inlined
 from mbagent_envs.random_keys import derive, derive_one, uniform_at, uniforms
+from mbagent_envs.structs import Struct
 
 
 @inlined
@@ -70,9 +73,6 @@ _TAG = 1 << 32
 _MERGE, _LATER = np.uint64(0x3E46E), np.uint64(0x1A7E5)
 """Salts of the random numbers that choose between merged strata, and of those that sample the later variables of strata."""
 
-Found: TypeAlias = tuple[Ints, Ints, Bools, Floats, Floats]
-"""Outcomes of rows: counts [B], states [M, F], terminated [M], probabilities [M]; and ``Particles.left`` of each row, [B]."""
-
 Grid: TypeAlias = tuple[int, np.uint64, float]
 """Number of grid points, key of their random numbers, and offset of the grid; see ``start``."""
 
@@ -85,8 +85,8 @@ LOW, HIGH, MASS, ORIGINAL_SHARE = range(4)
 weight of a stratum including merged ones; probability that no value so far was rare, or the stratum's own probability."""
 
 
-class Particles(NamedTuple):
-    """The particles of one row, in few arrays, since passing arrays between compiled functions costs run and compile time.
+class Particles(Struct):
+    """The particles of one row.
 
     Attributes:
         grid: see FIRST_POINT, int64 [2 n, 3].
@@ -112,7 +112,6 @@ def start(seed: int) -> tuple[np.uint64, float]:
     return key[0], float(uniforms(key, 1)[0, 0])
 
 
-@compiled
 def new_particles(n_grid: int, n_outputs: int, n_values: int) -> Particles:
     """Arrays for a row's particles, for ``n_outputs`` variables of at most ``n_values`` values."""
     return Particles(
@@ -405,58 +404,52 @@ def weigh(p: Particles, n_grid: int) -> None:
 
 
 @compiled
-def write(p: Particles, base: Ints, open_factors: Ints, n_open: int, n_grid: int, total: int, found: Found) -> int:
+def write(p: Particles, base: Ints, open_factors: Ints, n_open: int, n_grid: int, total: int, out: Outcomes) -> int:
     """Writes a row's outcomes from index ``total`` on, ``base`` [O] with the open factors' values; returns their number."""
-    _, states, terminated, probabilities, _ = found
-    n_factors = states.shape[1]
+    n_factors = out.states.shape[1]
     weigh(p, n_grid)
     for i in range(n_outcomes(p)):
         slot = slot_of(p, i, n_grid)
         for w in range(n_open):
             base[open_factors[w]] = p.factors[slot, w]
         for f in range(n_factors):
-            states[total + i, f] = base[f]
-        terminated[total + i] = base[n_factors] == 1
-        probabilities[total + i] = p.chances[slot, MASS]
+            out.states[total + i, f] = base[f]
+        out.terminated[total + i] = base[n_factors] == 1
+        out.probabilities[total + i] = p.chances[slot, MASS]
     return n_outcomes(p)
 
 
-@compiled
-def room(n_rows: int, n_grid: int, n_outputs: int) -> Found:
-    """Arrays for the maximum number of outcomes."""
+def outcomes_of_rows(n_rows: int, n_grid: int, n_outputs: int) -> Outcomes:
+    """Arrays for the maximum number of outcomes of ``n_rows`` rows, in which counts and ``left_out`` are [B]."""
     most = 2 * n_rows * n_grid
-    return (
+    return Outcomes(
         np.empty(n_rows, dtype=np.int64),
         np.empty((most, n_outputs - 1), dtype=np.int64),
         np.empty(most, dtype=np.bool_),
-        np.empty(most, dtype=np.float64),
-        np.zeros(n_rows, dtype=np.float64),
+        np.empty(most),
+        np.zeros(n_rows),
     )
 
 
-@compiled
-def used(found: Found, total: int) -> Found:
-    """The part of the arrays that is in use."""
-    counts, states, terminated, probabilities, left = found
-    return counts, states[:total], terminated[:total], probabilities[:total], left
+def listed(n_rows: int, n_samples: int, n_outputs: int, seed: int, kernel: Callable[[slice, Grid, Outcomes], int]) -> Successors:
+    """Successors of rows, which a kernel writes for a run of rows to given arrays, returning their number.
 
-
-def assemble(parts: list[Found], n_outputs: int) -> Successors:
-    """Successors from the outcomes of consecutive runs of rows."""
-    if not parts:
-        none = np.zeros((0, n_outputs - 1), dtype=np.int64)
-        return Successors(np.zeros(1, dtype=np.int64), none, np.zeros(0, dtype=np.bool_), np.zeros(0))
-    if len(parts) > 1:
-        counts, states, terminated, probabilities, _ = (np.concatenate(column) for column in zip(*parts, strict=True))
-    else:
-        counts, states, terminated, probabilities, _ = parts[0]
-    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    return Successors(offsets, states, terminated, probabilities)
-
-
-def rows_at_once(n_samples: int, n_outputs: int) -> int:
-    """Number of rows to process at once."""
-    return max(1, min(LARGEST_CHUNK, (1 << 24) // (2 * n_samples * n_outputs)))
+    Args:
+        n_rows: number of rows B.
+        n_samples: number of grid points of each row.
+        n_outputs: number of factors, with ``terminated``.
+        seed: of the grid.
+        kernel: called with the rows, the grid and the arrays.
+    """
+    offsets, parts = [np.zeros(1, dtype=np.int64)], []
+    step = max(1, min(LARGEST_CHUNK, (1 << 24) // (2 * n_samples * n_outputs)))
+    for first in range(0, max(n_rows, 1), step):
+        out = outcomes_of_rows(min(step, n_rows - first), n_samples, n_outputs)
+        total = kernel(slice(first, first + step), (n_samples, *start(seed)), out)
+        offsets.append(offsets[-1][-1] + np.cumsum(out.counts))
+        parts.append((out.states[:total], out.terminated[:total], out.probabilities[:total]))
+    columns = (np.concatenate(column) if len(parts) > 1 else column[0] for column in zip(*parts, strict=True))
+    return Successors(np.concatenate(offsets).astype(np.int64), *columns)
 
 
 def thin(full: Successors, n_samples: int, seed: int) -> Successors:
@@ -473,18 +466,18 @@ def thin(full: Successors, n_samples: int, seed: int) -> Successors:
     if counts.max(initial=0) <= n_samples:
         return full
     offsets = full.offsets.astype(np.int64)
-    counts, chosen, weights = _thinned(offsets, full.terminated, full.probabilities, (n_samples, *start(seed)))
+    work, values, grid = new_particles(n_samples, 2, int(counts.max())), np.empty(counts.max()), (n_samples, *start(seed))
+    counts, chosen, weights = _thinned(offsets, full.terminated, full.probabilities, work, values, grid)
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     return Successors(offsets, full.states[chosen], full.terminated[chosen], weights)
 
 
 @compiled
-def _thinned(offsets: Ints, terminated: Bools, probabilities: Floats, grid: Grid) -> tuple[Ints, Ints, Floats]:
+def _thinned(
+    offsets: Ints, terminated: Bools, probabilities: Floats, p: Particles, values: Floats, grid: Grid
+) -> tuple[Ints, Ints, Floats]:
     """Number of successors kept in each row, and the indices and probabilities of all that are kept."""
-    n_rows, n_grid, total, most = len(offsets) - 1, grid[0], 0, 0
-    for b in range(n_rows):
-        most = max(most, offsets[b + 1] - offsets[b])
-    p, values = new_particles(n_grid, 2, max(most, 2)), np.empty(max(most, 2), dtype=np.float64)
+    n_rows, n_grid, total = len(offsets) - 1, grid[0], 0
     counts, room = np.empty(n_rows, dtype=np.int64), len(probabilities)
     chosen, weights = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.float64)
     for b in range(n_rows):

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbagent.models.mdp import GraphArrays, StateGraph, expand_with, most_outcomes, room_for_outcomes
-from mbagent.models.overloads import work_for
+from mbagent.models.kernel import Kernel, Outcomes
+from mbagent.models.mdp import GraphArrays, StateGraph, expand_with
 from mbagent.types import Floats, Ints
-from mbagent_envs.jit import borrowed, compiled
+from mbagent_envs.jit import compiled
 from mbagent_envs.random_keys import derive, derive_one, uniform_at
 
 LAYER_WIDTH = 32
@@ -74,7 +74,9 @@ def _before(node: int, other: int, reach: Floats, depth: Ints) -> bool:
 
 @compiled
 def grow_around(
-    kernel: Any,
+    kernel: Kernel,
+    work: Any,
+    out: Outcomes,
     graph: GraphArrays,
     root: int,
     begin: int,
@@ -89,6 +91,8 @@ def grow_around(
 
     Args:
         kernel: the model's arrays.
+        work: see ``StateGraph.work_space``.
+        out: likewise.
         graph: nodes from number ``begin`` on, and the root, belong to this root.
         root: its node.
         begin: number of nodes before the expansion.
@@ -102,9 +106,6 @@ def grow_around(
     Returns:
         the remaining budget; 0 if nothing remains to be expanded.
     """
-    n_actions = graph.counts.shape[1]
-    arrays = work_for(kernel, n_samples), room_for_outcomes(n_actions, graph.states.shape[1], n_samples)
-    work_out, kernel, graph = borrowed(arrays), borrowed(kernel), borrowed(graph)
     waiting, chosen, n = np.empty(len(graph.tags), dtype=np.int64), np.empty(budget, dtype=np.int64), 0
     if not graph.expanded[root]:
         reach[root], depth[root] = 1.0, 0
@@ -119,15 +120,15 @@ def grow_around(
         if size == 0:
             budget = 0
             break
-        n_needed = most_outcomes(n_actions, n_samples) * size
+        n_needed = len(out.probabilities) * size
         if graph.sizes[0] + n_needed > len(graph.tags) or graph.sizes[1] + n_needed > len(graph.sources):
             break
         for i in range(size):
             chosen[i] = waiting[i]
         n = _drop(waiting, n, size)
-        n = _expand_levels(kernel, work_out, graph, chosen[:size], waiting, n, n_samples, seed, reach, depth)
+        n = _expand_levels(kernel, work, out, graph, chosen[:size], waiting, n, n_samples, seed, reach, depth)
         budget -= size
-    return budget + 0 * len(arrays[1].counts)  # the borrowed arrays must live until here
+    return budget
 
 
 @compiled
@@ -140,8 +141,9 @@ def _drop(waiting: Ints, n: int, size: int) -> int:
 
 @compiled
 def _expand_levels(
-    kernel: Any,
-    work_out: Any,
+    kernel: Kernel,
+    work: Any,
+    out: Outcomes,
     graph: GraphArrays,
     chosen: Ints,
     waiting: Ints,
@@ -167,7 +169,7 @@ def _expand_levels(
         offset = uniform_at(key, 0)
         for node in chosen:
             if depth[node] == level:
-                expand_with(kernel, work_out[0], graph, node, draws, key, offset, work_out[1])
+                expand_with(kernel, work, graph, node, draws, key, offset, out)
         last = level
     for node in range(first_node, graph.sizes[0]):
         reach[node], depth[node] = 0.0, _FAR
@@ -276,16 +278,17 @@ def place_in_group(groups: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _grow_compiled(graph: StateGraph, roots: NDArray[np.int64], max_states: int, n_samples: int, horizon: int, seed: int) -> None:
     """``grow_lookahead`` for models with compiled kernels: one root after the other."""
-    n_actions = graph.model.n_actions
+    kernel, (work, out) = graph.kernel, graph.work_space(n_samples)
+    assert kernel is not None
     for root in roots:
         budget, begin, at_once = max_states, len(graph), 64
         reach, depth = np.zeros(0), np.zeros(0, dtype=np.int64)
         while budget > 0:
-            n_needed = most_outcomes(n_actions, n_samples) * min(budget, at_once)
+            n_needed = len(out.probabilities) * min(budget, at_once)
             graph.reserve(n_needed, n_needed)
             more = len(graph.arrays.tags) - len(reach)
             reach, depth = np.append(reach, np.zeros(more)), np.append(depth, np.zeros(more, dtype=np.int64))
-            left = grow_around(graph.kernel, graph.arrays, root, begin, budget, n_samples, horizon, seed, reach, depth)
+            left = grow_around(kernel, work, out, graph.arrays, root, begin, budget, n_samples, horizon, seed, reach, depth)
             if left == budget:  # there was no room for the next batch
                 at_once *= 2
             budget = left

@@ -70,7 +70,7 @@ class PairRegression:
         dual = cho_solve(self._factor, values - mean)
         pairs = PAIRED * (x.T @ x.multiply(dual[:, None])).toarray() if self._paired else np.zeros((0, 0))
         level = mean - float(dual @ self._kernel_mean)
-        return LeafValues(self._common, self._first, self._column, level, x.T @ dual, pairs, *self._bounds)
+        return LeafValues(self._common, self._first, self._column, level, x.T @ dual, np.ascontiguousarray(pairs), *self._bounds)
 
     def values(self, leaf: LeafValues) -> Floats:
         """Predicted values [M] of the states ``valued``."""

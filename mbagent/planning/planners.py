@@ -22,7 +22,18 @@ from mbagent.planning.flat_monte_carlo import random_returns
 from mbagent.planning.lookahead import grow_lookahead
 from mbagent.planning.planner import Plan, PlannerSettings, best_actions
 from mbagent.planning.racing import LookaheadConfig, best_config
-from mbagent.planning.search import MAX_KEPT, Paths, Rules, Tables, begin_batch, carry_over, empty_paths, end_batch, measure_spans
+from mbagent.planning.search import (
+    MAX_KEPT,
+    Batch,
+    SearchRules,
+    SearchTree,
+    advance,
+    backup,
+    carry_over,
+    empty_batch,
+    measure_spans,
+    take_in,
+)
 from mbagent.planning.trajectories import PlanTrace, best_policy
 from mbagent.planning.value_iteration import (
     LOWEST_KNOWN,
@@ -185,15 +196,14 @@ class ValueIterationPlanner:
             return default
 
         def act(config: LookaheadConfig, states: States) -> Actions:
-            self._config = config
-            return best_actions(self._expand(states).scores)
+            racer._config = config
+            return best_actions(racer._expand(states).scores)
 
-        try:
-            self.settings = replace(settings, **RACED)
-            configs = (default._replace(leaf=leaf), default, LookaheadConfig(leaf, 1, settings.n_samples))
-            return best_config(replace(task, start=visited), configs, act)
-        finally:  # if the goal fails here, the next call races again
-            self.settings, self._config = settings, None
+        racer = type(self)(replace(settings, **RACED))
+        racer.set_model(task.model, task.start)
+        racer.set_goal(task.goal)
+        configs = (default._replace(leaf=leaf), default, LookaheadConfig(leaf, 1, settings.n_samples))
+        return best_config(replace(task, start=visited), configs, act)
 
     def _solved_mdp(self) -> SolvedMdp:
         if self._mdp is None:
@@ -280,7 +290,7 @@ class MctsPlanner(ValueIterationPlanner):
         if search is None:
             begin = self._lookahead if settings.leaf_values == "lookahead" else self._expanded_roots
             graph, solution, nodes = begin(roots)
-            search = _Search(self, graph, _first_tables(solution, nodes), nodes)
+            search = _Search(self, graph, _first_tree(solution, nodes))
         found = search.run(deadline)
         if settings.reuse_tree and len(roots) == 1:
             self._last = search
@@ -295,11 +305,11 @@ class MctsPlanner(ValueIterationPlanner):
         if root < 0 or not last.graph.expanded[root]:
             return None
         graph = self._spare = self._spare if self._spare is not None else StateGraph(self._known_model())
-        tables = carry_over(last.graph, last.tables, root, graph)
+        tree = carry_over(last.graph, last.tree, root, graph)
         if self.settings.leaf_values == "lookahead" and 2 * graph.expanded.sum() < self._chosen_config().states:
             return None
         self._expanded, self._spare = graph, last.graph
-        return _Search(self, graph, tables, np.zeros(1, dtype=np.int64), last.decision + 1)
+        return _Search(self, graph, tree, last.decision + 1)
 
     def _expanded_roots(self, roots: States) -> tuple[StateGraph, Values, Ints]:
         """As ``_lookahead``, but only the roots are expanded, and all values are 0."""
@@ -314,44 +324,33 @@ class MctsPlanner(ValueIterationPlanner):
 class _Search:
     """Searches for a batch of roots, one for each; no edge connects the groups of different roots."""
 
-    def __init__(self, planner: MctsPlanner, graph: StateGraph, tables: Tables, roots: Ints, decision: int = 0) -> None:
-        self.planner, self.graph, self.tables, self.roots, self.decision = planner, graph, tables, roots, decision
+    def __init__(self, planner: MctsPlanner, graph: StateGraph, tree: SearchTree, decision: int = 0) -> None:
+        self.planner, self.graph, self.tree, self.decision = planner, graph, tree, decision
         settings = self.settings = planner.settings
         rollouts = settings.leaf_values == "rollouts"
         prior = 0.0 if rollouts else settings.prior_visits
         # A reused tree must not see the random numbers that it was built with.
         key = derive(settings.seed, _REUSE_SALT, decision)[0] if decision else _key(settings.seed, 0)
-        self.rules = Rules(settings.gamma, settings.c_uct, prior, rollouts, settings.backup == "mean", key)
+        self.rules = SearchRules(settings.gamma, float(settings.c_uct), float(prior), rollouts, settings.backup == "mean", key)
         if not (rollouts and decision):
-            measure_spans(graph.arrays, roots, self.tables)
+            measure_spans(graph.arrays, tree)
 
     def run(self, deadline: float | None = None) -> Expanded:
         """Runs all simulations, or as many as fit before ``deadline``, a value of ``time.perf_counter``."""
         if deadline is not None:
             return self._run_until(deadline)
-        settings, done = self.settings, 0
-        size = min(settings.batch_size, settings.num_simulations)
-        paths, leaves = (
-            empty_paths(len(self.roots), size, settings.horizon),
-            np.empty(2 * len(self.roots) * size, dtype=np.int64),
-        )
-        while done < settings.num_simulations:
-            if settings.num_simulations - done < size:
-                size = settings.num_simulations - done
-                paths = empty_paths(len(self.roots), size, settings.horizon)
-            self._run_batch(paths, leaves, done)
-            done += size
+        total = self.settings.num_simulations
+        self._run(empty_batch(len(self.tree.roots), min(self.settings.batch_size, total), self.settings.horizon), 0, total)
         return self._result()
 
     def _run_until(self, deadline: float) -> Expanded:
         """Runs at least one batch; further ones if they and the final value iteration should end before the deadline."""
         size, done, now = self.settings.batch_size, 0, time.perf_counter()
-        paths = empty_paths(len(self.roots), size, self.settings.horizon)
-        leaves = np.empty(2 * len(self.roots) * size, dtype=np.int64)
+        batch = empty_batch(len(self.tree.roots), size, self.settings.horizon)
         last = 0.0
         while done == 0 or (now + last + self.planner.settling * len(self.graph) < deadline and len(self.graph) < MAX_SEARCHED):
             began = now
-            self._run_batch(paths, leaves, done)
+            self._run(batch, done, done + size)
             done, now = done + size, time.perf_counter()
             last = now - began
         found = self._result()
@@ -359,54 +358,60 @@ class _Search:
         return found
 
     def _result(self) -> Expanded:
-        graph, roots, t = self.graph, self.roots, self.tables
-        n, m, visits = len(graph), graph.n_edges, self.tables.root_visits
+        graph, roots, t = self.graph, self.tree.roots, self.tree
+        n, m, visits = len(graph), graph.n_edges, t.root_visits
         solution = Values(t.v[:n], t.q[:n], t.rewards[:m], t.frontier, t.leaf)
         if self.settings.backup == "mean":
             return Expanded(graph, roots, solution, visits, visits + 1e-6 * _scaled(t.q[roots]), t.visits[:n])
         settle(graph, solution, self.settings.gamma, FINAL_SWEEPS)
         return Expanded(graph, roots, solution, visits, break_ties(graph, solution.q, roots, self.settings.gamma))
 
-    def _run_batch(self, paths: Paths, leaves: Ints, done: int) -> None:
-        """One batch of simulations: one call of the model and one of the goal."""
+    def _run(self, batch: Batch, done: int, total: int) -> None:
+        """Runs simulations until ``total`` are done; for each batch that reaches new states, one call of model and goal."""
         graph, rules = self.graph, self.rules
-        n, n_widened = begin_batch(graph.arrays, self.roots, self.tables, rules, done, paths, leaves)
-        n_nodes, n_edges, first = len(graph), graph.n_edges, paths.leaves.size
-        n_samples = self.settings.n_samples if rules.rollouts else LEAF_SAMPLES
-        graph.expand(leaves[:n], n_samples, int(_key(self.settings.seed, done + 1)))
-        self._make_room()
-        self.tables.rewards[n_edges : graph.n_edges] = score_edges(graph, self.planner._known_goal(), n_edges)
-        ends = self._rollouts(paths, done) if rules.rollouts else np.empty(paths.ends.shape)
-        widened = leaves[first : first + n_widened]
-        end_batch(graph.arrays, self.roots, self.tables, rules, n_nodes, leaves[:n], widened, paths, ends)
+        while done < total:
+            done, size, n_reached, n_widened = advance(graph.arrays, self.tree, rules, batch, done, total)
+            if size == 0:
+                return
+            nodes = np.unique(np.concatenate([batch.reached[:n_reached], batch.widened[:n_widened]]))
+            n_nodes, n_edges = len(graph), graph.n_edges
+            n_samples = self.settings.n_samples if rules.rollouts else LEAF_SAMPLES
+            graph.expand(nodes, n_samples, int(_key(self.settings.seed, done + 1)))
+            self._make_room()
+            self.tree.rewards[n_edges : graph.n_edges] = score_edges(graph, self.planner._known_goal(), n_edges)
+            if rules.rollouts:
+                self._roll_out(batch, done, size)
+            take_in(graph.arrays, self.tree, rules, batch, n_nodes, nodes, n_widened)
+            backup(graph.arrays, self.tree, rules, batch, size)
+            done += size
 
     def _make_room(self) -> None:
-        """Enlarges the tables to the size of the graph."""
-        tables, n, m = self.tables, len(self.graph), self.graph.n_edges
-        if len(tables.v) < n:
-            v, q, visits, counted = (_longer(table, 2 * n) for table in tables[:4])
-            tables = tables._replace(v=v, q=q, visits=visits, counted=counted)
-        if len(tables.rewards) < m:
-            tables = tables._replace(rewards=_longer(tables.rewards, 2 * m))
-        self.tables = tables
+        """Enlarges the statistics to the size of the graph."""
+        tree, n, m = self.tree, len(self.graph), self.graph.n_edges
+        if len(tree.v) < n:
+            v, q, visits, counted = (_longer(table, 2 * n) for table in (tree.v, tree.q, tree.visits, tree.counted))
+            tree = replace(tree, v=v, q=q, visits=visits, counted=counted)
+        if len(tree.rewards) < m:
+            tree = replace(tree, rewards=_longer(tree.rewards, 2 * m))
+        self.tree = tree
 
-    def _rollouts(self, paths: Paths, done: int) -> Floats:
-        """Value [R, W] of the node at which each simulation ended, by random play."""
-        values, settings = np.zeros(paths.ends.shape), self.settings
-        alive = paths.ends >= 0
-        simulation = np.broadcast_to(done + np.arange(paths.ends.shape[1]), paths.ends.shape)[alive]
+    def _roll_out(self, batch: Batch, done: int, size: int) -> None:
+        """Evaluates the node at which each of the ``size`` simulations from each root ended by random play."""
+        settings, ends = self.settings, batch.ends[:, :size]
+        values, alive = np.zeros(ends.shape), ends >= 0
+        simulation = np.broadcast_to(done + np.arange(size), ends.shape)[alive]
         keys = derive(settings.seed, _SEARCH_SALT, simulation)
-        states = self.graph.states[paths.ends[alive]]
+        states = self.graph.states[ends[alive]]
         model, goal = self.planner._known_model(), self.planner._known_goal()
         values[alive] = random_returns(model, goal, states, keys, settings.horizon, settings.gamma)
-        return values
+        batch.end_values[:, :size] = values
 
 
-def _first_tables(solution: Values, roots: Ints) -> Tables:
-    """Tables before the first simulation."""
+def _first_tree(solution: Values, roots: Ints) -> SearchTree:
+    """Statistics before the first simulation."""
     q, spread = solution.q, solution.v[roots]
-    return Tables(
-        solution.v, q, np.zeros_like(q), np.zeros_like(q), solution.rewards, solution.frontier,
+    return SearchTree(
+        roots, solution.v, q, np.zeros_like(q), np.zeros_like(q), solution.rewards, solution.frontier,
         np.zeros((len(roots), q.shape[1])), np.ones(len(roots)), np.stack([spread, spread], axis=1), solution.leaf,
     )  # fmt: skip
 

@@ -6,7 +6,6 @@ The latter is linear in features and in pairs of features.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +14,11 @@ from mbagent.models.mdp import GraphArrays, StateGraph, grow_reachable
 from mbagent.models.protocol import TransitionModel
 from mbagent.planning.planner import best_actions
 from mbagent.types import Bools, Floats, Ints, Reward, States
-from mbagent_envs.jit import compiled
+from mbagent_envs.jit import compiled, inlined
+from mbagent_envs.structs import Struct
 
 
-class LeafValues(NamedTuple):
+class LeafValues(Struct):
     """A sum over the active features of a state and over pairs of them.
 
     Each of the C features is the test whether a factor has one value, other than its commonest.
@@ -148,7 +148,8 @@ def solve(graph: StateGraph, goal: Reward, gamma: float, n_groups: int = 1, leaf
     """
     zeros = np.zeros((len(graph), graph.model.n_actions))
     values = Values(zeros[:, 0].copy(), zeros, score_edges(graph, goal), np.zeros(n_groups), leaf)
-    evaluate(leaf, graph.states, graph.expanded, values.v)
+    if leaf is not LOWEST_KNOWN:
+        evaluate(leaf, graph.states, graph.expanded, values.v)
     settle(graph, values, gamma)
     return values
 
@@ -183,6 +184,16 @@ def bellman(node: int, graph: GraphArrays, rewards: Floats, gamma: float, v: Flo
     return best
 
 
+@inlined
+def _still_active(active: Bools, moved: Floats, tolerance: float, scale: Floats) -> bool:
+    """Removes groups whose values moved little from ``active`` [G]; returns whether any is left."""
+    left = False
+    for g in range(len(active)):
+        active[g] = active[g] and moved[g] > tolerance * max(scale[g], 1e-12)
+        left = left or active[g]
+    return bool(left)
+
+
 @compiled
 def _set_frontier(graph: GraphArrays, active: Bools, lows: Floats, moved: Floats, v: Floats, frontier: Floats) -> None:
     """Sets the unexpanded states of every active group to the lowest value of its expanded ones; updates the last three."""
@@ -212,10 +223,9 @@ def sweep(
 
     ``rewards``, ``v`` and ``q`` are as long as the graph has edges and nodes in use.
     """
-    n_groups = len(frontier)
-    lows = np.full(n_groups, np.inf)
     # Every group has its own stopping criterion: its values must not depend on the other groups of the same call.
-    moved, scale = np.zeros(n_groups), np.full(n_groups, 1e-12)
+    n_groups = len(frontier)
+    lows, moved, scale = np.zeros(n_groups), np.zeros(n_groups), np.zeros(n_groups)
     for s in range(len(v)):
         for a in range(q.shape[1]):
             expected = 0.0  # expected rewards, since a rare reward may be a thousand times larger than any other
@@ -223,8 +233,8 @@ def sweep(
                 expected += graph.probabilities[e] * rewards[e]
             scale[graph.groups[s]] = max(scale[graph.groups[s]], abs(expected))
     for _ in range(max_sweeps):
-        moved[:] = 0.0
-        lows[:] = np.inf
+        for g in range(n_groups):
+            moved[g], lows[g] = 0.0, np.inf
         for s in range(len(v) - 1, -1, -1):
             g = graph.groups[s]
             if not (active[g] and graph.expanded[s]):
@@ -235,8 +245,7 @@ def sweep(
             lows[g] = min(lows[g], best)
         if len(leaf.common) == 0:
             _set_frontier(graph, active, lows, moved, v, frontier)
-        active &= moved > tolerance * scale
-        if not active.any():
+        if not _still_active(active, moved, tolerance, scale):
             break
 
 
@@ -269,16 +278,22 @@ def break_ties(graph: StateGraph, q: Floats, roots: Ints, gamma: float) -> Float
 @compiled
 def _reach_unexpanded(graph: GraphArrays, q: Floats, tie: float, gamma: float, max_sweeps: int, reach: Floats) -> None:
     """Fills ``reach`` [N, A]: maximum discounted probability of reaching an unexpanded state by policies optimal for ``q``."""
-    w = np.where(graph.expanded[: len(q)], 0.0, 1.0)
-    active = np.ones(graph.groups[: len(q)].max() + 1, dtype=np.bool_)
+    n_groups = 0
+    w = np.zeros(len(q))
+    for s in range(len(q)):
+        w[s], n_groups = 0.0 if graph.expanded[s] else 1.0, max(n_groups, graph.groups[s] + 1)
+    active, moved, scale = np.ones(n_groups, dtype=np.bool_), np.zeros(n_groups), np.ones(n_groups)
     for _ in range(max_sweeps):
-        moved = np.zeros(len(active))
+        for g in range(n_groups):
+            moved[g] = 0.0
         for s in range(len(q) - 1, -1, -1):
             g = graph.groups[s]
             if not (active[g] and graph.expanded[s]):
                 continue
-            threshold = q[s].max() - tie * max(np.abs(q[s]).max(), 1e-12)
-            best = 0.0
+            best, top, largest = 0.0, q[s, 0], 1e-12
+            for a in range(q.shape[1]):
+                top, largest = max(top, q[s, a]), max(largest, abs(q[s, a]))
+            threshold = top - tie * largest
             for a in range(q.shape[1]):
                 total = 0.0
                 for e in range(graph.first[s, a], graph.first[s, a] + graph.counts[s, a]):
@@ -289,8 +304,7 @@ def _reach_unexpanded(graph: GraphArrays, q: Floats, tie: float, gamma: float, m
                     best = max(best, total)
             moved[g] = max(moved[g], abs(best - w[s]))
             w[s] = best
-        active &= moved > TOLERANCE
-        if not active.any():
+        if not _still_active(active, moved, TOLERANCE, scale):
             break
 
 

@@ -37,7 +37,7 @@ def test_reused_statistics_are_those_of_the_last_search(kind: str) -> None:
     made.plan(np.array([[0]]))
     last = made._last
     assert last is not None
-    old, tables = last.graph, last.tables
+    old, tables = last.graph, last.tree
     root = int(old.next_nodes[old.first[0, 0]])
     new = StateGraph(WORLD)
     taken = carry_over(old, tables, root, new)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -22,8 +24,8 @@ def test_values_are_sums_over_features_and_pairs(state: tuple[int, int], alone: 
 
 
 def test_values_stay_within_bounds() -> None:
-    assert leaf_value(leaf(PAIRS)._replace(high=3.0), np.array([1, 0])) == 3.0
-    assert leaf_value(leaf(PAIRS)._replace(low=2.0), np.array([0, 1])) == 2.0
+    assert leaf_value(replace(leaf(PAIRS), high=3.0), np.array([1, 0])) == 3.0
+    assert leaf_value(replace(leaf(PAIRS), low=2.0), np.array([0, 1])) == 2.0
 
 
 def test_skipped_states_keep_their_values() -> None:

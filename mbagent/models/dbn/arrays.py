@@ -7,7 +7,7 @@ files are validated, since compiled kernels check nothing.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,16 @@ from mbagent.models.dbn.leaf_prior import LeafPrior, fitted_prior
 from mbagent.models.dbn.score import Search
 from mbagent.types import Bools, Floats, Ints
 from mbagent_envs.jit import compiled, inlined
+from mbagent_envs.structs import Struct
+
+FEATURE, OFF, ON = range(3)
+"""Columns of ``Graphs.node``."""
+
+NODE = 1
+"""Column of ``Graphs.entry``."""
 
 
-class Graphs(NamedTuple):
+class Graphs(Struct):
     """The graphs of all variables.
 
     Attributes:
@@ -28,14 +35,11 @@ class Graphs(NamedTuple):
         pairs: where each variable's pairs (action class, value) begin, int64 [U + 1]; the number of a pair within a variable is
             ``action_class * cardinality + value``, see ``features.ActionEncoding``.
         entries: where the entries of each pair begin, int64 [pairs + 1].
-        values: the value whose probability an entry predicts, int64 [E].
-        nodes: its first node, int64 [E].
-        feature: the feature that a node tests, -1 at a leaf, int64 [nodes].
-        off, on: next node, int64 [nodes].
-        rate: probability at a leaf, [nodes].
-        spread: standard error of a leaf's rate, 0 if all its rows agree, [nodes].
-        persistence: share of a pair's rows in which the variable kept its value, [pairs]; 1 without rows.
-        unseen_mass: probability of values never observed after a pair, [pairs].
+        entry: the value whose probability an entry predicts, and its first node, int64 [E, 2].
+        node: the feature that a node tests, -1 at a leaf, and the next node where it is off and where it is on, int32 [nodes, 3].
+        leaf: probability at a leaf, and its standard error, 0 if all its rows agree, [nodes, 2].
+        smoothing: share of a pair's rows in which the variable kept its value, 1 without rows; and probability of values never
+            observed after the pair, [pairs, 2].
         start: where each variable's values begin in ``base``, int64 [U + 1].
         base: distribution of each variable's unseen values, [sum of cardinalities].
         still: probability that a variable without graphs changes, [1].
@@ -46,15 +50,10 @@ class Graphs(NamedTuple):
     changing: Ints
     pairs: Ints
     entries: Ints
-    values: Ints
-    nodes: Ints
-    feature: Ints
-    off: Ints
-    on: Ints
-    rate: Floats
-    spread: Floats
-    persistence: Floats
-    unseen_mass: Floats
+    entry: Ints
+    node: NDArray[np.int32]
+    leaf: Floats
+    smoothing: Floats
     start: Ints
     base: Floats
     still: Floats
@@ -90,15 +89,18 @@ class Nodes:
 
 def linked(
     entries: Ints | Sequence[tuple[int, int, int]], n_pairs: int, links: Sequence[tuple[int, int, int]]
-) -> tuple[Ints, Ints, Ints, Ints, Ints, Ints]:
-    """The arrays from ``entries`` to ``on`` of ``Graphs``, from entries (pair, value, node) and nodes (feature, off, on)."""
+) -> tuple[Ints, Ints, NDArray[np.int32]]:
+    """``entries``, ``entry`` and ``node`` of ``Graphs``, from entries (pair, value, node) and nodes (feature, off, on)."""
     table = np.asarray(entries, dtype=np.int64).reshape(-1, 3)
     table = table[np.lexsort(table.T[::-1])]
-    parts = np.asarray(links, dtype=np.int64).reshape(-1, 3)
     begins = np.searchsorted(table[:, 0], np.arange(n_pairs + 1)).astype(np.int64)
-    value, node = np.ascontiguousarray(table[:, 1:].T)
-    feature, off, on = np.ascontiguousarray(parts.T)
-    return begins, value, node, feature, off, on
+    return begins, np.ascontiguousarray(table[:, 1:]), np.asarray(links, dtype=np.int32).reshape(-1, 3)
+
+
+def ranges(first: Ints, sizes: Ints) -> Ints:
+    """Consecutive integers from each of ``first`` [N] on, ``sizes`` [N] of them, concatenated."""
+    result: Ints = np.arange(sizes.sum()) + np.repeat(first - np.cumsum(sizes) + sizes, sizes)
+    return result
 
 
 def build(
@@ -125,15 +127,12 @@ def build(
             entries.append(np.stack([pairs[question.variable] + question.pairs, question.values, first], axis=1))
     for variable, questions in with_operand.items():
         entries += _by_operand(nodes, questions, pairs[variable], int(layout.outputs[variable]), layout.encoding.n_action_classes)
-    rates = np.asarray(nodes.rates, dtype=np.float64).reshape(-1, 2)
     return Graphs(
         np.asarray(sorted({question.variable for question in asked}), dtype=np.int64),
         pairs,
         *linked(np.concatenate(entries), int(pairs[-1]), nodes.links),
-        np.ascontiguousarray(rates[:, 0]),
-        np.ascontiguousarray(rates[:, 1]),
-        np.concatenate([smoothing.persistence for smoothing in smoothings]),
-        np.concatenate([smoothing.unseen_mass for smoothing in smoothings]),
+        np.asarray(nodes.rates, dtype=np.float64).reshape(-1, 2),
+        np.concatenate([np.stack([smoothing.persistence, smoothing.unseen_mass], axis=1) for smoothing in smoothings]),
         np.concatenate([[0], np.cumsum(layout.outputs)]).astype(np.int64),
         np.concatenate([smoothing.base for smoothing in smoothings]),
         np.asarray([still]),
@@ -152,7 +151,7 @@ def _by_operand(
     return [np.stack([begin + action_class * cardinality + now, value, node], axis=1) for action_class in range(n_action_classes)]
 
 
-@compiled
+@inlined
 def read(state: Ints, variable: int, layout: Layout) -> int:
     """Value of a variable in a state [F]; 0 for ``terminated`` and the reset."""
     first, last = layout.first[variable], layout.first[variable + 1]
@@ -249,107 +248,97 @@ def without_noise(rate: float, spread: float, n: int, noise: float) -> float:
 
 
 @compiled
-def with_rest(
-    out: Floats,
-    base: Floats,
-    start: int,
-    n: int,
-    value: int,
-    total: float,
-    slack: float,
-    persistence: float,
-    unseen_mass: float,
-    known: bool,
-    asked: bool,
-    noise: float,
-) -> None:
-    """Completes a variable's distribution, ``out`` from ``start`` on, with the current value and the unseen values.
+def with_rest(out: Floats, graphs: Graphs, variable: int, pair: int, value: int, total: float, slack: float, asked: bool) -> None:
+    """Completes a variable's distribution in ``out`` with the current value and the unseen values.
 
     The graphs give the rates of all values but the current one, which gets the remaining probability. If the variable was never
     observed to keep its value, the remainder counts as an estimation error unless it exceeds ``slack``. For planning, it also
-    counts as one if graphs test features (``asked``) and the remainder is at most ``slack`` and less than half of
-    ``persistence``: the rows in which the value was kept may belong to other leaves.
+    counts as one if graphs test features (``asked``) and the remainder is at most ``slack`` and less than half of the pair's
+    persistence: the rows in which the value was kept may belong to other leaves.
     """
+    start, end, base, noise = graphs.start[variable], graphs.start[variable + 1], graphs.base, graphs.noise[0]
+    persistence, unseen_mass, known = graphs.smoothing[pair, 0], graphs.smoothing[pair, 1], has_graphs(graphs, pair)
     stay = 1.0 - total
     observed = not known or (persistence > 0.0 and (stay > slack or not asked or stay >= 0.5 * persistence))
     if known:
         stay = max(0.0, stay - slack) if persistence == 0.0 else max(stay, min(slack, persistence))
     out[start + value] = stay if observed or noise == 0.0 else -stay
     scale, top, left = (1.0 - unseen_mass) / (total + stay), 0.0, 0.0
-    for k in range(start, start + n):
+    for k in range(start, end):
         top = max(top, abs(out[k]) * scale + unseen_mass * base[k])
-    for k in range(start, start + n):
+    for k in range(start, end):
         chance = abs(out[k]) * scale + unseen_mass * base[k]
         out[k] = chance if out[k] > 0.0 or chance >= noise * top else 0.0
         left += out[k]
-    for k in range(start, start + n if noise > 0.0 else start):
+    for k in range(start, end if noise > 0.0 else start):
         out[k] /= left
+
+
+@inlined
+def has_graphs(graphs: Graphs, pair: int) -> bool:
+    """Whether a pair (action class, value) of a variable has graphs."""
+    return bool(graphs.entries[pair + 1] > graphs.entries[pair])
 
 
 @compiled
 def distributions(
     variables: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs, on: Bools, values: Ints, out: Floats
 ) -> None:
-    """Writes value and next distribution of some variables to ``values`` [U] and, from ``start[variable]`` on, to ``out``.
-
-    One call handles all variables, since passing the graphs costs more than evaluating a variable.
-    """
+    """Writes value and next distribution of some variables to ``values`` [U] and, from ``start[variable]`` on, to ``out``."""
+    noise, action_class = graphs.noise[0], layout.encoding.action_class[action]
     for variable in variables:
-        first, n, start = layout.first[variable], layout.outputs[variable], graphs.start[variable]
-        value = state[layout.members[first]] if layout.first[variable + 1] == first + 1 else 0
-        if layout.first[variable + 1] > first + 1:
-            for member in range(first, layout.first[variable + 1]):
-                if state[layout.members[member]] == 1:
-                    value = member - first
-                    break
+        n, start, value = layout.outputs[variable], graphs.start[variable], read(state, variable, layout)
         values[variable] = value
-        noise = graphs.noise[0]
-        pair = graphs.pairs[variable] + layout.encoding.action_class[action] * n + value
+        pair = graphs.pairs[variable] + action_class * n + value
         total, slack, tested = 0.0, 0.0, False
         for k in range(start, start + n):
             out[k] = 0.0
-        for entry in range(graphs.entries[pair], graphs.entries[pair + 1]):
-            node = graphs.nodes[entry]
-            tested |= graphs.feature[node] >= 0
-            while graphs.feature[node] >= 0:
-                node = graphs.on[node] if on[graphs.feature[node]] else graphs.off[node]
-            rate = without_noise(graphs.rate[node], graphs.spread[node], n, noise)
-            out[start + graphs.values[entry]] = rate
+        for e in range(graphs.entries[pair], graphs.entries[pair + 1]):
+            node = graphs.entry[e, 1]
+            tested |= graphs.node[node, 0] >= 0
+            while graphs.node[node, 0] >= 0:  # without a branch, which the processor could not predict
+                node = graphs.node[node, 1 + np.int64(on[graphs.node[node, 0]])]
+            rate = without_noise(graphs.leaf[node, 0], graphs.leaf[node, 1], n, noise)
+            out[start + graphs.entry[e, 0]] = rate
             total += abs(rate)
-            slack += 3.0 * graphs.spread[node]
-        known = graphs.entries[pair + 1] > graphs.entries[pair]
-        if n == 2:
-            change = graphs.still[0] if graphs.still[0] >= noise else 0.0
-            rate = out[start + 1] if known else change if value == 0 else 1.0 - change
-            out[start], out[start + 1] = 1.0 - rate, rate
+            slack += 3.0 * graphs.leaf[node, 1]
+        if n > 2:
+            with_rest(out, graphs, variable, pair, value, total, slack, tested)
             continue
-        with_rest(
-            out,
-            graphs.base,
-            start,
-            n,
-            value,
-            total,
-            slack,
-            graphs.persistence[pair],
-            graphs.unseen_mass[pair],
-            known,
-            tested,
-            noise,
-        )
+        usual = graphs.still[0] if graphs.still[0] >= noise else 0.0
+        rate = out[start + 1] if has_graphs(graphs, pair) else usual if value == 0 else 1.0 - usual
+        out[start], out[start + 1] = 1.0 - rate, rate
 
 
-_FILE_NAMES = {"feature": "column", "persistence": "stays", "unseen_mass": "novelty"}
-
-SAVED = {_FILE_NAMES.get(field, field): field for field in Graphs._fields if field != "noise"}
-"""Fields of ``Graphs`` by their names in files. ``noise`` belongs to planning and is not saved."""
+SAVED: dict[str, tuple[str, int | None]] = {
+    "changing": ("changing", None),
+    "pairs": ("pairs", None),
+    "entries": ("entries", None),
+    "values": ("entry", 0),
+    "nodes": ("entry", 1),
+    "column": ("node", 0),
+    "off": ("node", 1),
+    "on": ("node", 2),
+    "rate": ("leaf", 0),
+    "spread": ("leaf", 1),
+    "stays": ("smoothing", 0),
+    "novelty": ("smoothing", 1),
+    "start": ("start", None),
+    "base": ("base", None),
+    "still": ("still", None),
+}
+"""Arrays in files by name: field and column of ``Graphs``. ``noise`` belongs to planning and is not saved."""
 
 _FLOATS = ("rate", "spread", "stays", "novelty", "base", "still")
 
 
 def to_arrays(graphs: Graphs) -> dict[str, NDArray[Any]]:
-    """The graphs' arrays by name."""
-    return {name: getattr(graphs, field).copy() for name, field in SAVED.items()}
+    """The graphs' arrays by name, int64 or float64 [n]."""
+    arrays = {}
+    for name, (field, column) in SAVED.items():
+        array = getattr(graphs, field)
+        arrays[name] = np.array(array if column is None else array[:, column], dtype=np.float64 if name in _FLOATS else np.int64)
+    return arrays
 
 
 def table_of(array: NDArray[Any], width: int) -> NDArray[np.int64]:
@@ -377,24 +366,38 @@ def from_arrays(arrays: Mapping[str, NDArray[Any]], layout: Layout, n_features: 
     missing = sorted(set(SAVED) ^ set(arrays))
     if missing:
         raise ValueError(f"These weights are not decision graphs (first difference: {missing[0]!r}).")
-    kinds = {name: np.float64 if name in _FLOATS else np.int64 for name in SAVED}
-    flat: dict[str, Any] = {
-        SAVED[name]: np.ascontiguousarray(array, dtype=kinds[name]).reshape(-1) for name, array in arrays.items()
+    flat: dict[str, NDArray[Any]] = {
+        name: np.ascontiguousarray(arrays[name], dtype=np.float64 if name in _FLOATS else np.int64).reshape(-1) for name in SAVED
     }
-    graphs = Graphs(**flat, noise=np.zeros(1))
-    if not _sound(graphs, layout, n_features):
+    if not _sound(flat, layout, n_features):
         raise ValueError(
             "These weights do not fit: they are not graphs of these variables; load them into a model of the same environment."
         )
-    return graphs
+
+    def stacked(*names: str) -> NDArray[Any]:
+        return np.stack([flat[name] for name in names], axis=1)
+
+    return Graphs(
+        changing=flat["changing"],
+        pairs=flat["pairs"],
+        entries=flat["entries"],
+        entry=stacked("values", "nodes"),
+        node=stacked("column", "off", "on").astype(np.int32),
+        leaf=stacked("rate", "spread"),
+        smoothing=stacked("stays", "novelty"),
+        start=flat["start"],
+        base=flat["base"],
+        still=flat["still"],
+        noise=np.zeros(1),
+    )
 
 
-def _sound(graphs: Graphs, layout: Layout, n_features: int) -> bool:
-    """Whether all indices and values are valid and no path is a cycle."""
-    n_variables, n_nodes, n_entries = len(layout.outputs), len(graphs.feature), len(graphs.values)
+def _sound(flat: Mapping[str, NDArray[Any]], layout: Layout, n_features: int) -> bool:
+    """Whether all indices and values of the arrays from a file are valid and no path is a cycle."""
+    n_variables, n_nodes, n_entries = len(layout.outputs), len(flat["column"]), len(flat["values"])
     pairs = np.concatenate([[0], np.cumsum(layout.encoding.n_action_classes * layout.outputs)])
     start = np.concatenate([[0], np.cumsum(layout.outputs)])
-    if not (np.array_equal(graphs.pairs, pairs) and np.array_equal(graphs.start, start)):
+    if not (np.array_equal(flat["pairs"], pairs) and np.array_equal(flat["start"], start)):
         return False
     lengths = {
         "off": n_nodes,
@@ -408,30 +411,30 @@ def _sound(graphs: Graphs, layout: Layout, n_features: int) -> bool:
         "base": start[-1],
         "still": 1,
     }
-    if any(len(getattr(graphs, SAVED[name])) != length for name, length in lengths.items()):
+    if any(len(flat[name]) != length for name, length in lengths.items()):
         return False
-    shares = [getattr(graphs, SAVED[name]) for name in _FLOATS]
-    inner, numbers = graphs.feature >= 0, np.arange(n_nodes)
+    entries, inner, numbers = flat["entries"], flat["column"] >= 0, np.arange(n_nodes)
     return bool(
-        _within(graphs.changing, n_variables)
-        and _within(graphs.feature + 1, n_features + 1)
-        and _within(graphs.nodes, n_nodes)
-        and (np.diff(graphs.entries) >= 0).all()
-        and (graphs.entries[0], graphs.entries[-1]) == (0, n_entries)
-        and ((graphs.off >= 0) & (graphs.off < numbers))[inner].all()
-        and ((graphs.on >= 0) & (graphs.on < numbers))[inner].all()
-        and _values_fit(graphs, layout)
-        and all(np.isfinite(share).all() and (share >= 0.0).all() and (share <= 1.0).all() for share in shares)
-        and (np.add.reduceat(graphs.base, start[:-1]) <= 1.0 + 1e-6).all()
+        _within(flat["changing"], n_variables)
+        and _within(flat["column"] + 1, n_features + 1)
+        and _within(flat["nodes"], n_nodes)
+        and (np.diff(entries) >= 0).all()
+        and (entries[0], entries[-1]) == (0, n_entries)
+        and all(((flat[name] >= 0) & (flat[name] < numbers))[inner].all() for name in ("off", "on"))
+        and _values_fit(flat, layout)
+        and all(np.isfinite(flat[name]).all() and _within(flat[name], 1.0) for name in _FLOATS)
+        and (np.add.reduceat(flat["base"], start[:-1]) <= 1.0 + 1e-6).all()
     )
 
 
-def _values_fit(graphs: Graphs, layout: Layout) -> bool:
+def _values_fit(flat: Mapping[str, NDArray[Any]], layout: Layout) -> bool:
     """Whether each entry's value is less than its variable's cardinality."""
-    pair = np.repeat(np.arange(len(graphs.entries) - 1), np.diff(graphs.entries))
-    variable = np.searchsorted(graphs.pairs, pair, side="right") - 1
-    return bool(((graphs.values >= 0) & (graphs.values < layout.outputs[variable])).all())
+    pair = np.repeat(np.arange(len(flat["entries"]) - 1), np.diff(flat["entries"]))
+    variable = np.searchsorted(flat["pairs"], pair, side="right") - 1
+    return bool(((flat["values"] >= 0) & (flat["values"] < layout.outputs[variable])).all())
 
 
-def _within(values: NDArray[np.int64], n: int) -> bool:
-    return bool(((values >= 0) & (values < n)).all())
+def _within(values: NDArray[Any], n: float) -> bool:
+    """Whether all integers are in [0, n), or all floats in [0, n]."""
+    below = values < n if values.dtype == np.int64 else values <= n
+    return bool(((values >= 0) & below).all())

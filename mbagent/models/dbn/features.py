@@ -10,20 +10,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.data import Factors
-from mbagent.models.dbn.planes.invariants import NO_INVARIANTS
 from mbagent.models.dbn.score import Target
 from mbagent.types import Bools, Ints
 from mbagent_envs.random_keys import derive, hash_rows
+from mbagent_envs.structs import Struct
 
 
-class ActionEncoding(NamedTuple):
+class ActionEncoding(Struct):
     """The features of each of A actions, and their action classes.
 
     Attributes:
@@ -78,7 +78,7 @@ BEYOND = -1
 """Channel number of the border in adjacency features."""
 
 
-class Layout(NamedTuple):
+class Layout(Struct):
     """Variables and features of a state, as arrays that compiled kernels can read, too.
 
     Attributes:
@@ -86,6 +86,7 @@ class Layout(NamedTuple):
         first: where each variable's factors begin in ``members``, int64 [U + 1].
         members: factors of each variable; several for a group, one for a factor, none for the last two.
         factor, value, top: the state features, int64 [D']: on if the factor's value is at least ``value`` and at most ``top``.
+        first_feature: where each factor's features begin among these, int64 [F + 1].
         n_factors: number of factors F.
         encoding: the K features of actions, and the action classes.
         cells: if the observation is a stack of planes, the factor of each channel in each row and column, int64 [C, H, W];
@@ -108,6 +109,7 @@ class Layout(NamedTuple):
     factor: Ints
     value: Ints
     top: Ints
+    first_feature: Ints
     n_factors: int
     encoding: ActionEncoding
     cells: Ints
@@ -149,6 +151,7 @@ def make_layout(
         np.ascontiguousarray(factor),
         np.ascontiguousarray(value),
         np.ascontiguousarray(top),
+        np.searchsorted(factor, np.arange(len(cardinalities) + 1)).astype(np.int64),
         len(cardinalities),
         encoding,
         np.zeros((0, 0, 0), dtype=np.int64),
@@ -158,7 +161,8 @@ def make_layout(
         np.zeros(0, dtype=np.int64),
         np.zeros(0, dtype=np.bool_),
         np.full(len(sizes), -1, dtype=np.int64),
-        *NO_INVARIANTS,
+        np.zeros((0, 2), dtype=np.int64),
+        np.zeros(0, dtype=np.bool_),
         np.zeros(0, dtype=np.int64),
     )
 
@@ -186,7 +190,8 @@ def layout_with_mutexes(layout: Layout, mutexes: Sequence[Ints], exactly: Sequen
     of = np.full(len(layout.outputs), -1, dtype=np.int64)
     for number, variables in enumerate(mutexes):
         of[variables] = number
-    return layout._replace(
+    return replace(
+        layout,
         mutex_first=np.concatenate([[0], np.cumsum([len(variables) for variables in mutexes])]).astype(np.int64),
         mutex_members=np.concatenate([*mutexes, np.zeros(0, dtype=np.int64)]).astype(np.int64),
         exactly=np.asarray([False] * len(mutexes) if exactly is None else exactly, dtype=np.bool_),

@@ -18,7 +18,7 @@ from scipy.special import gammainc, ndtr
 
 from mbagent.data import Factors, TransitionBatch
 from mbagent.models.dbn import sampling
-from mbagent.models.dbn.arrays import Graphs, build
+from mbagent.models.dbn.arrays import FEATURE, Graphs, build
 from mbagent.models.dbn.effects import ABSOLUTE_EFFECT, EffectModel, for_all_actions, questions_for_effect, smoothing_for_effect
 from mbagent.models.dbn.features import (
     ActionEncoding,
@@ -101,7 +101,8 @@ ROWS_AT_ONCE = 2000
 
 def uncertain_rows(rows: TransitionBatch, layout: Layout, graphs: Graphs, variables: Ints) -> Bools:
     """In which rows the given variables need their synchronic graphs, bool [N, len(variables)]."""
-    found = [sampling.uncertain(part.states, part.actions, layout, graphs, variables) for part in rows.parts(ROWS_AT_ONCE)]
+    work = sampling.work_space(layout, graphs, graphs)
+    found = [sampling.uncertain(part.states, part.actions, work, variables) for part in rows.parts(ROWS_AT_ONCE)]
     return np.concatenate([np.zeros((0, len(variables)), dtype=np.bool_), *found])
 
 
@@ -120,8 +121,7 @@ class Asked(NamedTuple):
 def probabilities(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Floats:
     """Marginal probability of each feature of the next state for each row, [N, D']."""
     start = np.concatenate([[0], np.cumsum(_cardinalities(layout))]).astype(np.int64)
-    probs = np.zeros((len(rows), int(start[-1])))
-    sampling.marginals(rows.states, rows.actions, layout, graphs, start, probs)
+    probs = sampling.marginals(rows.states, rows.actions, layout, graphs, start)
     total = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(probs, axis=1)], axis=1)
     result: Floats = total[:, start[layout.factor] + layout.top + 1] - total[:, start[layout.factor] + layout.value]
     return result.clip(0.0, 1.0)
@@ -245,7 +245,7 @@ class Fitted:
 def for_planning(fitted: Fitted) -> Fitted:
     """The graphs for planning, where negligible values are possible outcomes only if they were observed."""
     names = ("usual", "synchronic", "reset", "reset_synchronic")
-    return replace(fitted, **{name: getattr(fitted, name)._replace(noise=np.full(1, NEGLIGIBLE)) for name in names})
+    return replace(fitted, **{name: replace(getattr(fitted, name), noise=np.full(1, NEGLIGIBLE)) for name in names})
 
 
 class _Table:
@@ -322,7 +322,9 @@ class _Table:
 
 def no_synchronic(graphs: Graphs) -> Graphs:
     """Graphs of no variable, for models without synchronic arcs."""
-    return graphs._replace(changing=np.zeros(0, dtype=np.int64), feature=np.full_like(graphs.feature, -1))
+    node = graphs.node.copy()
+    node[:, FEATURE] = -1
+    return replace(graphs, changing=np.zeros(0, dtype=np.int64), node=node)
 
 
 class Part(NamedTuple):
@@ -460,9 +462,8 @@ def _with_mutexes(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Layo
     on = rows.after[:, factors].astype(np.float32)
     some = np.linspace(0, len(rows) - 1, min(len(rows), MUTEX_ROWS)).astype(np.int64)
     start = np.concatenate([[0], np.cumsum(_cardinalities(layout))]).astype(np.int64)
-    probs = np.empty((len(some), int(start[-1])))
     few = rows.select(some)
-    sampling.marginals(few.states, few.actions, layout, graphs, start, probs)
+    probs = sampling.marginals(few.states, few.actions, layout, graphs, start)
     ones = probs[:, start[factors] + 1]
     expected = ones.T @ ones * (len(rows) / len(some))
     return layout_with_mutexes(layout, [bits[c] for c in find_cliques(np.rint(on.T @ on).astype(np.int64), expected)])
@@ -480,7 +481,7 @@ def indicator_rates(layout: Layout, rows: TransitionBatch, flags: Bools) -> Floa
     """Probability that a transition is flagged, given state and action, from a decision graph fitted to the flags [N], [N]."""
     table, every, last = _Table(layout, rows, flags, NO_EFFECTS, None), np.arange(len(rows)), len(layout.outputs) - 1
     graphs = _graphs(table, {last: every}, every, True, False).graphs
-    rates: Floats = sampling.reset_rates(rows.states, rows.actions, layout, graphs)
+    rates: Floats = sampling.reset_rates(rows.states, rows.actions, sampling.work_space(layout, graphs, graphs))
     return rates
 
 

@@ -141,11 +141,9 @@ class Table(NamedTuple):
 
 def table_of_rows(fitted: Fitted, rows: TransitionBatch) -> Table:
     """The transitions with their distributions."""
-    layout, graphs, synchronic = fitted.layout, fitted.usual, fitted.synchronic
-    parts = [
-        sampling.conditionals(p.states, p.actions, p.next_states, layout, graphs, synchronic).astype(np.float32)
-        for p in rows.parts(ROWS_AT_ONCE)
-    ]
+    layout, graphs = fitted.layout, fitted.usual
+    work = sampling.work_space(layout, graphs, fitted.synchronic)
+    parts = [sampling.conditionals(p.states, p.actions, p.next_states, work).astype(np.float32) for p in rows.parts(ROWS_AT_ONCE)]
     chances = np.concatenate([np.zeros((0, int(graphs.start[-1])), dtype=np.float32), *parts])
     return Table(
         variable_values(layout, rows.before).astype(np.int64), _seen(fitted, rows.after, rows.terminated), chances, graphs.start
@@ -330,11 +328,12 @@ class _Search:
         """Draws from the model, [N * draws] rows, with the distributions given what was drawn."""
         if self._drawn is None:
             f, parts, begin = self.fitted, [], 0
+            work = sampling.work_space(f.layout, f.usual, f.synchronic)
             for part in self.rows.parts(ROWS_AT_ONCE):
                 for copy in range(self.draws):
                     following, over = part.states.copy(), np.zeros(len(part), dtype=np.bool_)
                     keys = derive(np.arange(begin, begin + len(part), dtype=np.uint64), copy)
-                    sampling.sample(part.states, part.actions, keys, False, f.layout, f.usual, f.synchronic, following, over)
+                    sampling.sample(part.states, part.actions, keys, False, work, following, over)
                     parts.append(table_of_rows(f, replace(part, after=following, terminated=over)))
                 begin += len(part)
             now, then, chances = (np.concatenate([part[i] for part in parts]) for i in range(3))
@@ -370,16 +369,17 @@ def excess(fitted: Fitted, rows: TransitionBatch, patterns: Sequence[Pattern]) -
 
 def event_chances(fitted: Fitted, rows: TransitionBatch, patterns: Sequence[Pattern]) -> Floats:
     """Probability that a transition with one of the patterns is an event, given graphs with events, [N]; 0 without a pattern."""
-    layout, parts = fitted.layout, [np.zeros(0)]
+    parts = [np.zeros(0)]
+    usually = sampling.work_space(fitted.layout, fitted.usual, fitted.synchronic)
+    in_event = sampling.work_space(fitted.layout, fitted.reset, fitted.reset_synchronic)
     for part in rows.parts(ROWS_AT_ONCE):
         table, candidate = table_of_rows(fitted, part), np.zeros(len(part), dtype=np.bool_)
         for pattern in patterns:
             candidate |= table.occurs(pattern.items).all(axis=1)
         usual, event = (
-            sampling.log_prob(part.states, part.actions, part.next_states, part.terminated, layout, graphs, synchronic)
-            for graphs, synchronic in ((fitted.usual, fitted.synchronic), (fitted.reset, fitted.reset_synchronic))
+            sampling.log_prob(part.states, part.actions, part.next_states, part.terminated, work) for work in (usually, in_event)
         )
-        rate = sampling.reset_rates(part.states, part.actions, layout, fitted.usual)
+        rate = sampling.reset_rates(part.states, part.actions, usually)
         with np.errstate(divide="ignore", invalid="ignore"):
             odds = np.log(rate) + event - np.log1p(-rate) - usual
         odds[np.isnan(odds)] = -np.inf  # impossible with and without an event

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.data import TransitionBatch, TransitionDataset
-from mbagent.models.dbn.arrays import SAVED, Graphs, build, from_arrays, n_features, table_of, to_arrays
+from mbagent.models.dbn.arrays import FEATURE, NODE, OFF, ON, SAVED, Graphs, build, from_arrays, n_features, table_of, to_arrays
 from mbagent.models.dbn.change_points import last_changes
 from mbagent.models.dbn.effects import (
     EffectModel,
@@ -40,14 +40,14 @@ def tested_features(graphs: Graphs, variable: int) -> set[int]:
     if variable not in graphs.changing:
         return set()
     begin, end = graphs.entries[graphs.pairs[variable]], graphs.entries[graphs.pairs[variable + 1]]
-    stack, visited = [int(node) for node in graphs.nodes[begin:end]], set()
+    stack, visited = graphs.entry[begin:end, NODE].tolist(), set()
     while stack:
         node = stack.pop()
         if node not in visited:
             visited.add(node)
-            if graphs.feature[node] >= 0:
-                stack += [int(graphs.off[node]), int(graphs.on[node])]
-    return {int(graphs.feature[node]) for node in visited if graphs.feature[node] >= 0}
+            if graphs.node[node, FEATURE] >= 0:
+                stack += graphs.node[node, [OFF, ON]].tolist()
+    return {int(graphs.node[node, FEATURE]) for node in visited} - {-1}
 
 
 def depends_on_action(graphs: Graphs, variable: int, layout: Layout) -> bool:
@@ -55,8 +55,8 @@ def depends_on_action(graphs: Graphs, variable: int, layout: Layout) -> bool:
     n, first = int(layout.outputs[variable]), int(graphs.pairs[variable])
 
     def entries_of(pair: int) -> list[tuple[int, int]]:
-        entries = range(graphs.entries[first + pair], graphs.entries[first + pair + 1])
-        return [(int(graphs.values[e]), int(graphs.nodes[e])) for e in entries]
+        entries: list[tuple[int, int]] = graphs.entry[graphs.entries[first + pair] : graphs.entries[first + pair + 1]].tolist()
+        return entries
 
     return any(
         entries_of(action_class * n + value) != entries_of(value)
@@ -177,7 +177,7 @@ class DecisionGraphModel(GraphPredictions):
         self.fitted = fit(rows, redrawn, since=since)
         if progress is not None:
             progress(1.0)
-        figures = {"nodes": float(len(self.fitted.usual.feature)), "events": float(redrawn.rows.sum())}
+        figures = {"nodes": float(len(self.fitted.usual.node)), "events": float(redrawn.rows.sum())}
         figures |= {"changed": float((since > 0).sum()), "left out": float(n_observed - len(rows))}
         report = self._report((len(rows), len(held_out)), likelihood, exact, figures)
         memory = self._memory(train, held_out)

@@ -106,13 +106,9 @@ def _grow(swaps: NDArray[np.floating[Any]], exclusive: Bools, free: Bools) -> ND
     return np.asarray(group, dtype=np.int64)
 
 
-@compiled
 def widest(layout: Layout) -> int:
     """Size of the largest distribution of a variable or mutex group."""
-    room = layout.outputs.max()
-    for q in range(len(layout.exactly)):
-        room = max(room, layout.mutex_first[q + 1] - layout.mutex_first[q] + 1)
-    return int(room)
+    return int(max(layout.outputs.max(), np.diff(layout.mutex_first).max(initial=0) + 1))
 
 
 @compiled
@@ -152,7 +148,9 @@ def n_choices(mutex: int, state: Ints, rates: Floats, still: Bools, layout: Layo
 @compiled
 def leave_out_none(chances: Floats, n: int) -> None:
     """Removes "none", the last of ``n`` probabilities, if it is negligible compared with the largest: an error of the rates."""
-    none, top = chances[n - 1], chances[:n].max()
+    none, top = chances[n - 1], 0.0
+    for k in range(n):
+        top = max(top, chances[k])
     if 0.0 < none < NEGLIGIBLE * top:
         chances[n - 1] = 0.0
         for k in range(n - 1):
@@ -167,14 +165,20 @@ def settle(state: Ints, mutex: int, chosen: int, layout: Layout) -> None:
         state[layout.members[layout.first[layout.mutex_members[first + k]]]] = 1 if k == chosen else 0
 
 
-@compiled
-def which(state: Ints, mutex: int, layout: Layout) -> int:
-    """Which bit of a mutex group is on; the number of bits if none is, -1 if several are."""
-    first, last = layout.mutex_first[mutex], layout.mutex_first[mutex + 1]
-    found = last - first
-    for k in range(last - first):
-        if state[layout.members[layout.first[layout.mutex_members[first + k]]]] == 1:
-            if found < last - first:
-                return -1
-            found = k
-    return int(found)
+def mutex_bits(mutex: int, layout: Layout) -> Ints:
+    """Factors of a mutex group's bits, int64."""
+    variables = layout.mutex_members[layout.mutex_first[mutex] : layout.mutex_first[mutex + 1]]
+    result: Ints = layout.members[layout.first[variables]]
+    return result
+
+
+def mutex_chances(mutex: int, states: Ints, rates: Floats, still: Bools, layout: Layout, graphs: Graphs) -> Floats:
+    """As ``mutex_distribution``, of states [B, F] with ``rates`` [B, sum of cardinalities]: [B, number of bits + 1]."""
+    variables = layout.mutex_members[layout.mutex_first[mutex] : layout.mutex_first[mutex + 1]]
+    chances = np.where(still[variables], states[:, mutex_bits(mutex, layout)], rates[:, graphs.start[variables] + 1])
+    total = np.zeros(len(states))
+    for column in chances.T:
+        total += column
+    none = np.where(layout.exactly[mutex] & (total > 1e-9), 0.0, np.maximum(0.0, 1.0 - total))
+    result: Floats = np.concatenate([chances, none[:, None]], axis=1) / (total + none)[:, None]
+    return result

@@ -10,15 +10,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.types import Bools, Floats, Ints
-from mbagent_envs.jit import compiled
-
-Tables: TypeAlias = tuple[Floats, Floats, Floats]
+from mbagent_envs.jit import compiled, inlined
+from mbagent_envs.structs import Struct
 
 BY_ALL, BY_ACTION, BY_VALUE, BY_CONTEXT = 0, 1, 2, 3
 """Sets of contexts that a split can apply to: all, those of one action, those of one current value, or a single one."""
@@ -27,7 +26,7 @@ STRENGTH = 0.2
 """Both parameters of the Beta prior."""
 
 
-class FeatureBlocks(NamedTuple):
+class FeatureBlocks(Struct):
     """Features that are on in each row, in compressed sparse row format.
 
     Attributes:
@@ -41,7 +40,7 @@ class FeatureBlocks(NamedTuple):
     n_features: int
 
 
-class Target(NamedTuple):
+class Target(Struct):
     """A one-vs-rest target: patterns after which a value of a variable is possible, and how often it was observed.
 
     Attributes:
@@ -84,6 +83,20 @@ def feature_blocks(table: NDArray[np.generic]) -> FeatureBlocks:
     return FeatureBlocks(first, feature.astype(np.int64), table.shape[1])
 
 
+class Tables(Struct):
+    """Logarithms from which ``evidence`` of up to n rows is computed, [n + 1] each.
+
+    Attributes:
+        one: of rising factorials of one parameter of the Beta prior.
+        two: of the sum of both parameters.
+        alike: evidence of outcomes that are all equal.
+    """
+
+    one: Floats
+    two: Floats
+    alike: Floats
+
+
 def evidence_tables(n: int, certain: float = 0.0, strength: float = STRENGTH) -> Tables:
     """Tables from which ``evidence`` of up to ``n`` rows is computed.
 
@@ -98,25 +111,25 @@ def evidence_tables(n: int, certain: float = 0.0, strength: float = STRENGTH) ->
     with np.errstate(divide="ignore"):
         alike = np.logaddexp(np.log(0.5 * certain), one - two)
     alike[0] = 0.0
-    return one, two, alike
+    return Tables(one, two, alike)
 
 
-@compiled
-def evidence(positives: int, n: int, one: Floats, two: Floats, alike: Floats) -> float:
+@inlined
+def evidence(positives: int, n: int, tables: Tables) -> float:
     """Log marginal likelihood of ``positives`` among ``n`` outcomes."""
     if positives == 0 or positives == n:
-        return float(alike[n])
-    return float(one[positives] + one[n - positives] - two[n])
+        return float(tables.alike[n])
+    return float(tables.one[positives] + tables.one[n - positives] - tables.two[n])
 
 
 def evidences(positives: Ints, n: Ints, tables: Tables) -> Floats:
     """As ``evidence``, of many."""
-    one, two, alike = tables
+    one, two, alike = tables.one, tables.two, tables.alike
     result: Floats = np.where((positives == 0) | (positives == n), alike[n], one[positives] + one[n - positives] - two[n])
     return result
 
 
-class Tally(NamedTuple):
+class Tally(Struct):
     """Counts of a target's rows.
 
     Attributes:
@@ -130,60 +143,45 @@ class Tally(NamedTuple):
     positives_on: Ints
 
 
-@compiled
 def count(target: Target, features: FeatureBlocks) -> Tally:
     """Counts rows and positives of each context, in all and with each feature on."""
-    n_contexts = len(target.action)
-    n, e = np.zeros((2, n_contexts), dtype=np.int64)
-    on, positives_on = np.zeros((2, n_contexts, features.n_features), dtype=np.int64)
+    counts = np.zeros((2, len(target.action)), dtype=np.int64)
+    on = np.zeros((2, len(target.action), features.n_features), dtype=np.int64)
+    tally = Tally(*counts, *on)
+    _count(target, features, tally)
+    return tally
+
+
+@compiled
+def _count(target: Target, features: FeatureBlocks, tally: Tally) -> None:
+    """Adds all rows to the counts."""
     for r in range(len(target.rows)):
-        context, counts, positives = target.context[r], target.counts[r], target.positives[r]
-        n[context] += counts
-        e[context] += positives
-        for j in range(features.first[target.rows[r]], features.first[target.rows[r] + 1]):
-            on[context, features.feature[j]] += counts
-            positives_on[context, features.feature[j]] += positives
-    return Tally(n, e, on, positives_on)
+        context, counts, positives, row = target.context[r], target.counts[r], target.positives[r], target.rows[r]
+        tally.n[context] += counts
+        tally.e[context] += positives
+        for j in range(features.first[row], features.first[row + 1]):
+            tally.on[context, features.feature[j]] += counts
+            tally.positives_on[context, features.feature[j]] += positives
 
 
-class Sets(NamedTuple):
-    """Sets of contexts that a split can apply to: all, those of each action, those of each current value.
+class Sets(Struct):
+    """Sets of contexts that a split can apply to: all, those of each action, those of each current value; and work space.
 
     Attributes:
-        of: numbers of the sets that contain each context, int64 [C, 3]; the last set is a placeholder that is never used.
-        n, e: rows and positives of each set, int64 [S].
-        evidence: evidence of a set's contexts with separate rates, summed, [S].
-        base: evidence of each context's own rate, [C].
         n_actions: number of sets of actions.
+        of: numbers of the sets that contain each context, int64 [C, 3]; the last set is a placeholder that is never used.
+        base: evidence of each context's own rate, [C].
+        counts: rows and positives of each set; rows and positives with a feature on, int64 [S, 4].
+        evidence: evidence of a set's contexts with separate rates: of all rows; with a feature on; with it off, [S, 3].
     """
 
-    of: Ints
-    n: Ints
-    e: Ints
-    evidence: Floats
-    base: Floats
     n_actions: int
+    of: Ints
+    base: Floats
+    counts: Ints
+    evidence: Floats
 
 
-@compiled
-def _sets(target: Target, n: Ints, e: Ints, one: Floats, two: Floats, alike: Floats) -> Sets:
-    n_actions, n_values = target.action.max() + 1, target.value.max() + 1
-    n_sets = 2 + n_actions + n_values
-    of = np.zeros((len(n), 3), dtype=np.int64)
-    of[:, 1] = np.where(target.action < 0, n_sets - 1, 1 + target.action)
-    of[:, 2] = np.where(target.value < 0, n_sets - 1, 1 + n_actions + target.value)
-    rows, positives = np.zeros((2, n_sets), dtype=np.int64)
-    total, base = np.zeros(n_sets), np.empty(len(n))
-    for c in range(len(n)):
-        base[c] = evidence(e[c], n[c], one, two, alike)
-        for s in of[c]:
-            rows[s] += n[c]
-            positives[s] += e[c]
-            total[s] += base[c]
-    return Sets(of, rows, positives, total, base, n_actions)
-
-
-@compiled
 def best_split(target: Target, tally: Tally, prior: Floats, narrow: Floats, tables: Tables) -> Chosen:
     """The split with the highest gain.
 
@@ -196,41 +194,71 @@ def best_split(target: Target, tally: Tally, prior: Floats, narrow: Floats, tabl
         narrow: log prior odds to be added for contexts of one action, of one value, and for a single context, [3].
         tables: ``evidence_tables`` for at least the sum of the target's counts.
     """
-    one, two, alike = tables
-    n, e, on, positives_on = tally
-    sets = _sets(target, n, e, one, two, alike)
-    n_sets = len(sets.n)
-    set_n, set_e = np.zeros((2, n_sets), dtype=np.int64)
-    inside, outside = np.zeros((2, n_sets))
+    n_actions, n_contexts = int(target.action.max()) + 1, len(target.action)
+    n_sets = 3 + n_actions + int(target.value.max())
+    of = np.zeros((n_contexts, 3), dtype=np.int64)
+    of[:, 1] = np.where(target.action < 0, n_sets - 1, 1 + target.action)
+    of[:, 2] = np.where(target.value < 0, n_sets - 1, 1 + n_actions + target.value)
+    sets = Sets(n_actions, of, np.empty(n_contexts), np.zeros((n_sets, 4), dtype=np.int64), np.zeros((n_sets, 3)))
+    return Chosen(*_best_split(tally, sets, prior, narrow, tables))
+
+
+@inlined
+def _kind(s: int, n_actions: int) -> tuple[int, int]:
+    """Kind of the set of contexts number ``s``, see ``Chosen``, and number of the first set of that kind."""
+    if s == 0:
+        return BY_ALL, 0
+    return (BY_ACTION, 1) if s <= n_actions else (BY_VALUE, 1 + n_actions)
+
+
+@inlined
+def _count_sets(tally: Tally, sets: Sets, tables: Tables) -> None:
+    """Adds all contexts to the first two counts, and to the first evidence, of their sets."""
+    n, e, of, counts = tally.n, tally.e, sets.of, sets.counts
+    for c in range(len(n)):
+        sets.base[c] = evidence(e[c], n[c], tables)
+        for i in range(3):
+            counts[of[c, i], 0] += n[c]
+            counts[of[c, i], 1] += e[c]
+            sets.evidence[of[c, i], 0] += sets.base[c]
+
+
+@compiled
+def _best_split(tally: Tally, sets: Sets, prior: Floats, narrow: Floats, tables: Tables) -> tuple[float, int, int, int]:
+    """See ``best_split`` and ``Chosen``."""
+    n, e, on, positives_on = tally.n, tally.e, tally.on, tally.positives_on
+    of, counts, total, n_sets, n_actions = sets.of, sets.counts, sets.evidence, len(sets.counts), sets.n_actions
+    _count_sets(tally, sets, tables)
     best, kind, which, chosen = 0.0, 0, 0, 0
     for b in range(on.shape[1]):
         if prior[b] == -math.inf:
             continue
-        set_n[:], set_e[:], inside[:], outside[:] = 0, 0, 0.0, sets.evidence
+        for s in range(n_sets):
+            counts[s, 2], counts[s, 3], total[s, 1], total[s, 2] = 0, 0, 0.0, total[s, 0]
         for c in range(len(n)):
             if on[c, b] == 0:
                 continue
-            own = evidence(positives_on[c, b], on[c, b], one, two, alike)
-            others = evidence(e[c] - positives_on[c, b], n[c] - on[c, b], one, two, alike) - sets.base[c]
-            for s in sets.of[c]:
-                set_n[s] += on[c, b]
-                set_e[s] += positives_on[c, b]
-                inside[s] += own
-                outside[s] += others
+            own = evidence(positives_on[c, b], on[c, b], tables)
+            others = evidence(e[c] - positives_on[c, b], n[c] - on[c, b], tables) - sets.base[c]
+            for i in range(3):
+                counts[of[c, i], 2] += on[c, b]
+                counts[of[c, i], 3] += positives_on[c, b]
+                total[of[c, i], 1] += own
+                total[of[c, i], 2] += others
             gain = own + others + prior[b] + narrow[2]
             if gain > best and on[c, b] < n[c]:
                 best, kind, which, chosen = gain, BY_CONTEXT, c, b
         for s in range(n_sets - 1):
-            if set_n[s] == 0 or set_n[s] == sets.n[s]:
+            rows, positives = counts[s, 2], counts[s, 3]
+            if rows == 0 or rows == counts[s, 0]:
                 continue
-            gain = max(inside[s], evidence(set_e[s], set_n[s], one, two, alike)) - sets.evidence[s] + prior[b]
-            gain += max(outside[s], evidence(sets.e[s] - set_e[s], sets.n[s] - set_n[s], one, two, alike))
-            gain += 0.0 if s == 0 else narrow[0] if s <= sets.n_actions else narrow[1]
+            gain = max(total[s, 1], evidence(positives, rows, tables)) - total[s, 0] + prior[b]
+            gain += max(total[s, 2], evidence(counts[s, 1] - positives, counts[s, 0] - rows, tables))
+            kind_of, first = _kind(s, n_actions)
+            gain += 0.0 if s == 0 else narrow[kind_of - 1]
             if gain > best:
-                kind = BY_ALL if s == 0 else BY_ACTION if s <= sets.n_actions else BY_VALUE
-                best, chosen = gain, b
-                which = 0 if s == 0 else s - 1 if s <= sets.n_actions else s - 1 - sets.n_actions
-    return Chosen(best, kind, which, chosen)
+                best, kind, which, chosen = gain, kind_of, s - first, b
+    return best, kind, which, chosen
 
 
 MOST_KEPT = 100_000
@@ -368,7 +396,7 @@ class Search:
                 np.minimum.at(low, merged, old)
                 np.maximum.at(high, merged, old)
             labels.append(np.where(low == high, low, -1))
-        self.target = target._replace(context=context, action=labels[0], value=labels[1])
+        self.target = replace(target, context=context, action=labels[0], value=labels[1])
         self.prior_mean = prior_mean[:size]
         self._tally = None
         self.splits.append(split)

@@ -223,12 +223,14 @@ def _best_patterns(
 
     Only entries above the diagonal are pairs.
     """
-    one, two, alike = tables
     size = len(both_n)
-    best, which = np.full((size, size), -math.inf), np.zeros((size, size), dtype=np.int64)
-    cells_n, cells_e, before = np.zeros(4, dtype=np.int64), np.zeros(4, dtype=np.int64), evidence(e, n, one, two, alike)
+    best, which = np.zeros((size, size)), np.zeros((size, size), dtype=np.int64)
+    cells_n, cells_e, before = np.zeros(4, dtype=np.int64), np.zeros(4, dtype=np.int64), evidence(e, n, tables)
     for i in range(size):
+        for j in range(i + 1):
+            best[i, j] = -math.inf
         for j in range(i + 1, size):
+            best[i, j] = -math.inf
             for cells, both, total in ((cells_n, both_n, n), (cells_e, both_e, e)):
                 cells[3] = both[i, j]
                 cells[2] = both[i, i] - both[i, j]
@@ -240,8 +242,8 @@ def _best_patterns(
                     if inside[number, cell]:
                         n_in += cells_n[cell]
                         e_in += cells_e[cell]
-                gain = patterns[number] + evidence(e_in, n_in, one, two, alike)
-                gain += evidence(e - e_in, n - n_in, one, two, alike)
+                gain = patterns[number] + evidence(e_in, n_in, tables)
+                gain += evidence(e - e_in, n - n_in, tables)
                 if gain > best[i, j]:
                     best[i, j], which[i, j] = gain, number
             best[i, j] += prior[i, j] - before

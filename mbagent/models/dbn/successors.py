@@ -9,188 +9,199 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.models.base import BaseTransitionModel
-from mbagent.models.dbn import expander as expander  # registers its overloads
 from mbagent.models.dbn import sampling
-from mbagent.models.dbn.affected_variables import AffectedIndex, affected_index, only_end_is_synchronic
-from mbagent.models.dbn.arrays import Graphs, distributions, n_features, show, show_next, show_next_adjacencies, write
+from mbagent.models.dbn.affected_variables import only_end_is_synchronic
+from mbagent.models.dbn.arrays import Graphs, distributions, show_next, show_next_adjacencies, write
+from mbagent.models.dbn.expander import GraphKernel
 from mbagent.models.dbn.features import Layout
 from mbagent.models.dbn.fitting import Fitted, for_planning
 from mbagent.models.dbn.mutex import leave_out_none, mutex_distribution, n_choices, settle
-from mbagent.models.dbn.planes.invariants import COVERING, MOST_TRIES, Invariants, all_kept, enforced, kept_chances, leave_out
-from mbagent.models.dbn.sampling import Work, alone, needs_synchronic, only_possible, work_space
-from mbagent.models.overloads import Outcomes, implements, outcomes, work_for
+from mbagent.models.dbn.planes.invariants import (
+    COVERING,
+    MOST_TRIES,
+    all_kept,
+    enforced,
+    has_invariants,
+    kept_chances,
+    leave_out,
+)
+from mbagent.models.dbn.sampling import Work, evaluate, needs_synchronic, only_possible, work_space
+from mbagent.models.kernel import Outcomes, work_for
 from mbagent.models.protocol import Successors, as_keys
 from mbagent.models.systematic_sampling import (
     MAIN,
     MASS,
     STRATA,
-    Found,
     Grid,
     Particles,
-    assemble,
     begin,
+    listed,
     n_outcomes,
     n_possible,
     new_particles,
     place_of,
-    room,
-    rows_at_once,
     share_out,
     slot_of,
-    start,
-    used,
     weigh,
 )
 from mbagent.types import Actions, Bools, Floats, Ints, Keys, Randomness, States
 from mbagent_envs.jit import compiled
 from mbagent_envs.random_keys import derive, uniforms
+from mbagent_envs.structs import Struct
+
+
+class RowWork(Struct):
+    """Graphs, and work space to list the outcomes of one row at a time.
+
+    Attributes:
+        w: graphs, and work space to evaluate them.
+        p: particles.
+        early: variables without synchronic arcs, then mutex groups (from number U on), int64.
+        still_open: the variables and mutex groups with several possible outcomes, int64 [U + Q].
+        base: the next state except for these, int64 [F].
+        following: the next state of a particle, int64 [F].
+    """
+
+    w: Work
+    p: Particles
+    early: Ints
+    still_open: Ints
+    base: Ints
+    following: Ints
+
+
+def row_work(layout: Layout, graphs: Graphs, synchronic: Graphs, n_grid: int) -> RowWork:
+    """Work space for at most ``n_grid`` samples."""
+    w, n_variables = work_space(layout, graphs, synchronic), len(layout.outputs)
+    width = n_variables + len(layout.exactly)
+    return RowWork(
+        w,
+        new_particles(n_grid, width, len(w.joint)),
+        np.concatenate([w.alone[w.alone < n_variables - 1], np.arange(n_variables, width)]),
+        np.empty(width, dtype=np.int64),
+        np.empty(layout.n_factors, dtype=np.int64),
+        np.empty(layout.n_factors, dtype=np.int64),
+    )
 
 
 @compiled
-def successors(states: Ints, actions: Ints, layout: Layout, graphs: Graphs, synchronic: Graphs, grid: Grid) -> Found:
-    """The outcomes of each row, variable by variable; see ``systematic_sampling.py``. The graphs must be those for planning."""
-    w, n_variables, n_grid = work_space(layout, graphs, synchronic), len(layout.outputs), grid[0]
-    single = alone(layout, graphs, w.later)
-    early = np.concatenate((single[single < n_variables - 1], n_variables + np.arange(len(layout.exactly))))
-    width = n_variables + len(layout.exactly)
-    p, found = new_particles(n_grid, width, len(w.joint)), room(len(states), n_grid, states.shape[1] + 1)
-    still_open, base = np.empty(width, dtype=np.int64), np.empty(states.shape[1], dtype=np.int64)
+def successors(states: Ints, actions: Ints, r: RowWork, grid: Grid, out: Outcomes) -> int:
+    """Writes the outcomes of rows to ``out``, with counts and ``left_out`` [B]; returns their total number."""
     total = 0
     for b in range(len(states)):
-        show(states[b], actions[b], layout, w.on)
-        distributions(graphs.changing, states[b], actions[b], layout, graphs, w.on, w.values, w.rates)
-        base[:] = states[b]
-        n_open, ended = 0, False
-        begin(p, n_grid, _fits(early, states[b], actions[b], layout, graphs, synchronic, w, n_grid), place_of(states[b]))
-        for number in early:
-            n, value = _distribution(number, states[b], layout, graphs, w)
-            best = only_possible(w.joint, 0, n)
-            if best >= 0:
-                if best != value:
-                    ended = _put(base, number, best, layout, ended)
-                continue
-            still_open[n_open] = number
-            share_out(p, -1, number, n_open, w.joint, n, number == n_variables - 2, grid)
-            n_open += 1
-        if len(synchronic.changing):
-            n_open = _split_synchronic(
-                p, n_open, states[b], actions[b], base, still_open, ended, layout, graphs, synchronic, w, grid
-            )
-        _list(p, n_open, base, still_open, ended, layout, found, b, total, n_grid)
-        total += found[0][b]
-    return used(found, total)
+        out.counts[b] = row_outcomes(states[b], actions[b], r, grid, total, out)
+        out.left_out[b] = r.p.left[0]
+        total += out.counts[b]
+    return total
 
 
 @compiled
-def _fits(
-    early: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs, synchronic: Graphs, w: Work, n_grid: int
-) -> bool:
+def row_outcomes(state: Ints, action: int, r: RowWork, grid: Grid, total: int, out: Outcomes) -> int:
+    """Writes the outcomes of a row from number ``total`` on, variable by variable; returns their number.
+
+    See ``systematic_sampling.py``. The graphs must be those for planning.
+    """
+    w, p, layout, synchronic, n_grid = r.w, r.p, r.w.layout, r.w.synchronic, grid[0]
+    evaluate(state, action, w.graphs.changing, w)
+    for f in range(len(state)):
+        r.base[f] = state[f]
+    n_open, ended, end = 0, False, len(layout.outputs) - 2
+    begin(p, n_grid, _fits(state, action, r, n_grid), place_of(state))
+    for number in r.early:
+        n, value = _distribution(number, state, w)
+        best = only_possible(w.joint, 0, n)
+        if best >= 0:
+            if best != value:
+                ended = _put(r.base, number, best, layout, ended)
+            continue
+        r.still_open[n_open] = number
+        share_out(p, -1, number, n_open, w.joint, n, number == end, grid)
+        n_open += 1
+    if len(synchronic.changing):
+        n_open = _split_synchronic(r, n_open, state, action, ended, grid)
+    weigh(p, n_grid)
+    for i in range(n_outcomes(p)):
+        slot = slot_of(p, i, n_grid)
+        out.terminated[total + i] = _fill(out.states[total + i], r, slot, n_open, ended)
+        out.probabilities[total + i] = p.chances[slot, MASS]
+    return n_outcomes(p)
+
+
+@compiled
+def _fits(state: Ints, action: int, r: RowWork, n_grid: int) -> bool:
     """Whether all outcomes of a row can be listed."""
-    possible = 1
-    for number in early:
+    w, layout, graphs, possible = r.w, r.w.layout, r.w.graphs, 1
+    for number in r.early:
         if number >= len(layout.outputs):
             possible *= n_choices(number - len(layout.outputs), state, w.rates, w.still, layout, graphs)
         else:
             possible *= n_possible(w.rates, graphs.start[number], layout.outputs[number])
         if possible > n_grid:
             return False
-    for variable in synchronic.changing:
-        needed = needs_synchronic(variable, action, w, layout, graphs)
+    for variable in w.synchronic.changing:
+        needed = needs_synchronic(variable, action, w)
         possible *= layout.outputs[variable] if needed else n_possible(w.rates, graphs.start[variable], layout.outputs[variable])
         possible = min(possible, 2 * n_grid + 1)
     return bool(possible <= 2 * n_grid)
 
 
 @compiled
-def _distribution(number: int, state: Ints, layout: Layout, graphs: Graphs, w: Work) -> tuple[int, int]:
+def _distribution(number: int, state: Ints, w: Work) -> tuple[int, int]:
     """Writes the distribution of a variable or mutex group to ``w.joint``; returns its size and the current value or -1."""
-    n_variables = len(layout.outputs)
+    n_variables = len(w.layout.outputs)
     if number >= n_variables:
-        n = mutex_distribution(number - n_variables, state, w.rates, w.still, layout, graphs, w.joint) + 1
+        n = mutex_distribution(number - n_variables, state, w.rates, w.still, w.layout, w.graphs, w.joint) + 1
         leave_out_none(w.joint, n)
         return n, -1
-    n, start = layout.outputs[number], graphs.start[number]
-    w.joint[:n] = w.rates[start : start + n]
+    n, start = w.layout.outputs[number], w.graphs.start[number]
+    for k in range(n):
+        w.joint[k] = w.rates[start + k]
     return n, w.values[number]
 
 
 @compiled
-def _split_synchronic(
-    p: Particles,
-    n_open: int,
-    state: Ints,
-    action: int,
-    base: Ints,
-    still_open: Ints,
-    ended: bool,
-    layout: Layout,
-    graphs: Graphs,
-    synchronic: Graphs,
-    w: Work,
-    grid: Grid,
-) -> int:
+def _split_synchronic(r: RowWork, n_open: int, state: Ints, action: int, ended: bool, grid: Grid) -> int:
     """Draws variables with synchronic arcs, given each particle's next state so far; returns the new ``n_open``."""
-    following, end = np.empty_like(base), len(layout.outputs) - 2
+    w, p, layout, synchronic = r.w, r.p, r.w.layout, r.w.synchronic
+    end = len(layout.outputs) - 2
     for i in range(len(synchronic.changing)):
         number = synchronic.changing[i]
         n, start = layout.outputs[number], synchronic.start[number]
-        still_open[n_open] = number
-        if not needs_synchronic(number, action, w, layout, graphs):
-            w.joint[:n] = w.rates[start : start + n]
+        r.still_open[n_open] = number
+        if not needs_synchronic(number, action, w):
+            for k in range(n):
+                w.joint[k] = w.rates[start + k]
             share_out(p, -1, number, n_open, w.joint, n, number == end, grid)
             n_open += 1
             continue
         n_main, n_strata = p.state[MAIN], p.state[STRATA]
         for j in range(n_main + n_strata):
             slot = grid[0] + j if j < n_strata else j - n_strata  # strata first
-            _fill(following, base, p, slot, still_open, n_open, layout, ended)
-            show_next(following, layout, w.on)
+            _fill(r.following, r, slot, n_open, ended)
+            show_next(r.following, layout, w.on)
             if number == end:
-                show_next_adjacencies(following, layout, w.on)
+                show_next_adjacencies(r.following, layout, w.on)
             distributions(synchronic.changing[i : i + 1], state, action, layout, synchronic, w.on, w.values, w.rates)
-            w.joint[:n] = w.rates[start : start + n]
+            for k in range(n):
+                w.joint[k] = w.rates[start + k]
             share_out(p, slot, number, n_open, w.joint, n, number == end, grid)
         n_open += 1
     return n_open
 
 
 @compiled
-def _list(
-    p: Particles,
-    n_open: int,
-    base: Ints,
-    still_open: Ints,
-    ended: bool,
-    layout: Layout,
-    found: Found,
-    b: int,
-    total: int,
-    n_grid: int,
-) -> None:
-    """Writes the outcomes of row b from number ``total`` on."""
-    counts, following, terminated, probabilities, left = found
-    weigh(p, n_grid)
-    left[b] = p.left[0]
-    counts[b] = n_outcomes(p)
-    for i in range(counts[b]):
-        slot = slot_of(p, i, n_grid)
-        terminated[total + i] = _fill(following[total + i], base, p, slot, still_open, n_open, layout, ended)
-        probabilities[total + i] = p.chances[slot, MASS]
-
-
-@compiled
-def _fill(state: Ints, base: Ints, p: Particles, slot: int, still_open: Ints, n_open: int, layout: Layout, ended: bool) -> bool:
+def _fill(state: Ints, r: RowWork, slot: int, n_open: int, ended: bool) -> bool:
     """Writes the next state that a particle represents; returns whether the episode is over."""
-    state[:] = base
     over = ended
+    for f in range(len(state)):
+        state[f] = r.base[f]
     for v in range(n_open):
-        over = _put(state, still_open[v], p.factors[slot, v], layout, over)
+        over = _put(state, r.still_open[v], r.p.factors[slot, v], r.w.layout, over)
     return over
 
 
@@ -227,7 +238,50 @@ def mixed(parts: Sequence[tuple[NDArray[np.int64], NDArray[np.float64], Successo
     return Successors(offsets, states, terminated, weights[order])
 
 
-class WholeKernel(NamedTuple):
+class WholeWork(Struct):
+    """Work space: of usual steps and of resets, and the index of the reset variable, int64 [1]."""
+
+    usual: RowWork
+    in_reset: RowWork
+    reset: Ints
+
+
+@compiled
+def whole_outcomes(
+    kernel: WholeKernel, work: WholeWork, state: Ints, n_grid: int, key: np.uint64, offset: float, out: Outcomes
+) -> int:
+    """See ``Kernel.outcomes``; all variables are evaluated."""
+    layout, w, total = kernel.layout, work.usual.w, 0
+    for action in range(len(layout.encoding.action_class)):
+        rate = 0.0
+        if kernel.has_reset:
+            evaluate(state, action, work.reset, w)
+            rate = w.rates[w.graphs.start[-1] - 1]
+        draws, n, out.left_out[action] = reset_draws(rate, n_grid), 0, 0.0
+        if rate < 1.0:
+            n = row_outcomes(state, action, work.usual, (max(1, n_grid - draws), key, offset), total, out)
+            _weigh_by(1.0 - rate, total, n, out)
+            out.left_out[action] += (1.0 - rate) * work.usual.p.left[0]
+        if rate > 0.0:
+            more = row_outcomes(state, action, work.in_reset, (draws, key, offset), total + n, out)
+            _weigh_by(rate, total + n, more, out)
+            out.left_out[action] += rate * work.in_reset.p.left[0]
+            n += more
+        if len(layout.counts) or len(layout.observed):
+            n = leave_out(layout, state, total, n, out)
+        out.counts[action] = n
+        total += n
+    return total
+
+
+@compiled
+def _weigh_by(share: float, first: int, n: int, out: Outcomes) -> None:
+    """Multiplies the probabilities of ``n`` outcomes from number ``first`` on by a share."""
+    for q in range(first, first + n):
+        out.probabilities[q] *= share
+
+
+class WholeKernel(Struct):
     """Decision graphs for compiled search, for models with resets or synchronic arcs.
 
     Attributes:
@@ -241,97 +295,26 @@ class WholeKernel(NamedTuple):
     reset_synchronic: Graphs
     has_reset: bool
 
+    outcomes = staticmethod(whole_outcomes)
 
-def kernel_of(fitted: Fitted, cardinalities: tuple[int, ...]) -> AffectedIndex | WholeKernel:
-    """The kernel of fitted graphs for planning: an ``AffectedIndex`` if possible, else a ``WholeKernel``."""
+
+def kernel_of(fitted: Fitted, cardinalities: tuple[int, ...]) -> GraphKernel | WholeKernel:
+    """The kernel of fitted graphs for planning: an ``GraphKernel`` if possible, else a ``WholeKernel``."""
     if not fitted.has_reset and only_end_is_synchronic(fitted.layout, fitted.synchronic):
-        return affected_index(fitted.layout, fitted.usual, fitted.synchronic, cardinalities)
+        return GraphKernel.of(fitted.layout, fitted.usual, fitted.synchronic, cardinalities)
     f = fitted
     return WholeKernel(f.layout, f.usual, f.synchronic, f.reset, f.reset_synchronic, bool(f.has_reset))
 
 
-class WholeWork(NamedTuple):
-    """Work space.
-
-    Attributes:
-        on: features, bool [D].
-        values: current values of the variables, int64 [U].
-        rates: next-value distributions, [sum of cardinalities].
-        actions: indices of all actions, int64 [A].
-        states: the current state, int64 [1, F].
-        reset: index of the reset variable, int64 [1].
-    """
-
-    on: Bools
-    values: Ints
-    rates: Floats
-    actions: Ints
-    states: Ints
-    reset: Ints
-
-
-@implements(work_for, WholeKernel)
-@compiled
+@work_for.register
 def whole_work(kernel: WholeKernel, n_grid: int) -> WholeWork:
-    """See ``overloads.work_for``."""
-    layout = kernel.layout
+    """See ``kernel.work_for``."""
+    k, layout = kernel, kernel.layout
     return WholeWork(
-        np.empty(n_features(layout), dtype=np.bool_),
-        np.empty(len(layout.outputs), dtype=np.int64),
-        np.empty(kernel.usual.start[-1], dtype=np.float64),
-        np.arange(len(layout.encoding.action_class)),
-        np.empty((1, layout.n_factors), dtype=np.int64),
+        row_work(layout, k.usual, k.synchronic, n_grid),
+        row_work(layout, k.reset, k.reset_synchronic, n_grid),
         np.array([len(layout.outputs) - 1]),
     )
-
-
-@implements(outcomes, WholeKernel)
-@compiled
-def whole_outcomes(
-    kernel: WholeKernel, work: WholeWork, state: Ints, n_grid: int, key: np.uint64, offset: float, out: Outcomes
-) -> int:
-    """See ``overloads.outcomes``; all variables are evaluated."""
-    layout, graphs, states, actions, total = kernel.layout, kernel.usual, work.states, work.actions, 0
-    states[:] = state
-    for action in range(len(layout.encoding.action_class)):
-        rate, a = 0.0, action
-        if kernel.has_reset:
-            show(state, action, layout, work.on)
-            distributions(work.reset, state, action, layout, graphs, work.on, work.values, work.rates)
-            rate = work.rates[graphs.start[-1] - 1]
-        draws, n, out.left_out[action] = reset_draws(rate, n_grid), 0, 0.0
-        if rate < 1.0:
-            grid = (max(1, n_grid - draws), key, offset)
-            found = successors(states[:1], actions[a : a + 1], layout, graphs, kernel.synchronic, grid)
-            n = _take(found[1], found[2], found[3], 1.0 - rate, total, out)
-            out.left_out[action] += (1.0 - rate) * found[4][0]
-        if rate > 0.0:
-            grid = (draws, key, offset)
-            found = successors(states[:1], actions[a : a + 1], layout, kernel.reset, kernel.reset_synchronic, grid)
-            n += _take(found[1], found[2], found[3], rate, total + n, out)
-            out.left_out[action] += rate * found[4][0]
-        if len(layout.counts) or len(layout.observed):
-            n = _leave_out(layout, state, total, n, out)
-        out.counts[action] = n
-        total += n
-    return total
-
-
-@compiled
-def _leave_out(layout: Layout, state: Ints, first: int, n: int, out: Outcomes) -> int:
-    """Removes outcomes that violate an invariant from the last ``n``; returns how many are left."""
-    counts, observed, weights, cells = layout.counts, layout.observed, layout.weights, layout.cells
-    return leave_out(counts, observed, weights, cells, state, out.states, out.terminated, out.probabilities, first, n)
-
-
-@compiled
-def _take(states: Ints, terminated: Bools, probabilities: Floats, share: float, total: int, out: Outcomes) -> int:
-    """Copies outcomes, which have a share of the probability, to ``out`` from number ``total`` on; returns how many."""
-    for q in range(len(states)):
-        out.states[total + q] = states[q]
-        out.terminated[total + q] = terminated[q]
-        out.probabilities[total + q] = share * probabilities[q]
-    return len(states)
 
 
 _RESET = 1 << 33
@@ -350,10 +333,10 @@ class GraphPredictions(BaseTransitionModel):
 
     fitted: Fitted
     _planned: tuple[Fitted, Fitted] | None = None
-    _kernel: tuple[Fitted, AffectedIndex | WholeKernel] | None = None
+    _kernel: tuple[Fitted, GraphKernel | WholeKernel] | None = None
 
-    def kernel(self) -> AffectedIndex | WholeKernel:
-        """The graphs for compiled search, see ``models/overloads.py``."""
+    def kernel(self) -> GraphKernel | WholeKernel:
+        """The graphs for compiled search, see ``models/kernel.py``."""
         if self._kernel is None or self._kernel[0] is not self.fitted:
             self._kernel = self.fitted, kernel_of(self._for_planning(), self.cardinalities)
         return self._kernel[1]
@@ -363,14 +346,11 @@ class GraphPredictions(BaseTransitionModel):
             self._planned = self.fitted, for_planning(self.fitted)
         return self._planned[1]
 
-    @property
-    def _invariants(self) -> Invariants:
-        return Invariants(self.fitted.layout.counts, self.fitted.layout.observed)
+    def _work(self) -> Work:
+        return sampling.work_space(self.fitted.layout, self.fitted.usual, self.fitted.synchronic)
 
-    @property
-    def _cells(self) -> tuple[Ints, Ints]:
-        """Weights and cells of the invariants: see ``invariants.keeps``."""
-        return self.fitted.layout.weights, self.fitted.layout.cells
+    def _work_in_reset(self) -> Work:
+        return sampling.work_space(self.fitted.layout, self.fitted.reset, self.fitted.reset_synchronic)
 
     def _rows(self, states: States, actions: Actions) -> tuple[States, Actions]:
         states, actions = np.ascontiguousarray(states, dtype=np.int64), np.ascontiguousarray(actions, dtype=np.int64)
@@ -384,7 +364,7 @@ class GraphPredictions(BaseTransitionModel):
     def _reset_rates(self, states: States, actions: Actions) -> Floats:
         if not self.fitted.has_reset:
             return np.zeros(len(states))
-        rates: Floats = sampling.reset_rates(states, actions, self.fitted.layout, self.fitted.usual)
+        rates: Floats = sampling.reset_rates(states, actions, self._work())
         return rates
 
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
@@ -392,8 +372,8 @@ class GraphPredictions(BaseTransitionModel):
         states, actions = self._rows(states, actions)
         keys = as_keys(rng, len(states))
         following, over = self._draw(states, actions, keys)
-        for again in range(0 if self._invariants.none else MOST_TRIES):
-            wrong = np.flatnonzero(~over & ~all_kept(*self._invariants, *self._cells, states, following))
+        for again in range(MOST_TRIES if has_invariants(self.fitted.layout) else 0):
+            wrong = np.flatnonzero(~over & ~all_kept(self.fitted.layout, states, following))
             if len(wrong) == 0:
                 break
             redrawn, ends = self._draw(states[wrong], actions[wrong], derive(keys[wrong], _AGAIN + again))
@@ -402,14 +382,14 @@ class GraphPredictions(BaseTransitionModel):
 
     def _draw(self, states: States, actions: Actions, keys: Keys, greedy: bool = False) -> tuple[States, Bools]:
         """Draws by keys, or takes the most probable value of each variable."""
-        fitted, following, over = self.fitted, states.copy(), np.zeros(len(states), dtype=np.bool_)
-        sampling.sample(states, actions, keys, greedy, fitted.layout, fitted.usual, fitted.synchronic, following, over)
+        following, over = states.copy(), np.zeros(len(states), dtype=np.bool_)
+        sampling.sample(states, actions, keys, greedy, self._work(), following, over)
         uniform = 0.5 if greedy else uniforms(derive(keys, _RESET), 1)[:, 0]
         happens = np.flatnonzero(uniform < self._reset_rates(states, actions))
         if len(happens):
             given, ends = states[happens], np.zeros(len(happens), dtype=np.bool_)
-            redrawn, graphs = given.copy(), (fitted.reset, fitted.reset_synchronic)
-            sampling.sample(given, actions[happens], keys[happens], greedy, fitted.layout, *graphs, redrawn, ends)
+            redrawn = given.copy()
+            sampling.sample(given, actions[happens], keys[happens], greedy, self._work_in_reset(), redrawn, ends)
             following[happens], over[happens] = redrawn, ends
         return following, over
 
@@ -422,12 +402,11 @@ class GraphPredictions(BaseTransitionModel):
         """See TransitionModel; the marginals of variables with synchronic arcs are those learned without these arcs."""
         states, actions = self._rows(states, actions)
         start = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64)
-        fitted, probs = self.fitted, np.empty((len(states), int(start[-1])))
-        sampling.marginals(states, actions, fitted.layout, fitted.usual, start, probs)
+        fitted = self.fitted
+        probs = sampling.marginals(states, actions, fitted.layout, fitted.usual, start)
         if fitted.has_reset:
-            rate, redrawn = self._reset_rates(states, actions)[:, None], np.empty_like(probs)
-            sampling.marginals(states, actions, fitted.layout, fitted.reset, start, redrawn)
-            probs += rate * (redrawn - probs)
+            redrawn = sampling.marginals(states, actions, fitted.layout, fitted.reset, start)
+            probs += self._reset_rates(states, actions)[:, None] * (redrawn - probs)
         return probs
 
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
@@ -438,17 +417,17 @@ class GraphPredictions(BaseTransitionModel):
         states, actions = self._rows(states, actions)
         following, over = np.ascontiguousarray(next_states, dtype=np.int64), np.ascontiguousarray(terminated, dtype=np.bool_)
         layout = self.fitted.layout
-        usual: Floats = sampling.log_prob(states, actions, following, over, layout, self.fitted.usual, self.fitted.synchronic)
-        if not self._invariants.none:
+        usual: Floats = sampling.log_prob(states, actions, following, over, self._work())
+        if has_invariants(layout):
             planned = self._for_planning()
             found = self._successors(states, actions, planned.usual, planned.synchronic, COVERING, 0)
-            kept = all_kept(*self._invariants, *self._cells, states, following)
-            chances = kept_chances(self._invariants, *self._cells, states, found)
+            kept = all_kept(layout, states, following)
+            chances = kept_chances(layout, states, found)
             usual[~over] = np.where(kept, usual - np.log(chances), -np.inf)[~over]
         if not self.fitted.has_reset:
             return usual
         rate = self._reset_rates(states, actions)
-        reset = sampling.log_prob(states, actions, following, over, layout, self.fitted.reset, self.fitted.reset_synchronic)
+        reset = sampling.log_prob(states, actions, following, over, self._work_in_reset())
         with np.errstate(divide="ignore"):
             return np.logaddexp(np.log1p(-rate) + usual, np.log(rate) + reset)
 
@@ -458,8 +437,8 @@ class GraphPredictions(BaseTransitionModel):
         planned = self._for_planning()
         if not self.fitted.has_reset:
             usual = self._successors(states, actions, planned.usual, planned.synchronic, n_samples, seed)
-            return enforced(self._invariants, *self._cells, states, usual)
-        rates: Floats = sampling.reset_rates(states, actions, planned.layout, planned.usual)
+            return enforced(self.fitted.layout, states, usual)
+        rates: Floats = sampling.reset_rates(states, actions, work_space(planned.layout, planned.usual, planned.synchronic))
         n_resets = np.array([reset_draws(rate, n_samples) for rate in rates], dtype=np.int64)
         parts = []
         for n in np.unique(n_resets):
@@ -477,11 +456,9 @@ class GraphPredictions(BaseTransitionModel):
     def _successors(
         self, states: States, actions: Actions, graphs: Graphs, synchronic: Graphs, n_samples: int, seed: int
     ) -> Successors:
-        key, offset = start(seed)
-        layout, n_outputs = self.fitted.layout, states.shape[1] + 1
-        step = rows_at_once(n_samples, n_outputs)
-        parts = [
-            successors(states[b : b + step], actions[b : b + step], layout, graphs, synchronic, (n_samples, key, offset))
-            for b in range(0, len(states), step)
-        ]
-        return assemble(parts, n_outputs)
+        work = row_work(self.fitted.layout, graphs, synchronic, n_samples)
+
+        def write(rows: slice, grid: Grid, out: Outcomes) -> int:
+            return successors(states[rows], actions[rows], work, grid, out)
+
+        return listed(len(states), n_samples, states.shape[1] + 1, seed, write)

@@ -262,7 +262,7 @@ class NeuralTransitionModel(NetworkPair):
         )
 
     def kernel(self) -> BitRules | None:
-        """The truth tables of pruned networks, for compiled search (see ``models.overloads``); None if there are none."""
+        """The truth tables of pruned networks, for compiled search (see ``models.kernel``); None if there are none."""
         return self.rules(settled=True)
 
     def rules(self, settled: bool = False) -> BitRules | None:

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mbagent.models.kernel import Outcomes
 from mbagent.models.neural.kernels import (
     Floats32,
     GroupWeights,
@@ -35,21 +36,17 @@ from mbagent.models.systematic_sampling import (
     MAIN,
     NEGLIGIBLE,
     STRATA,
-    Found,
     Grid,
-    assemble,
+    Particles,
     begin,
     draw,
     largest,
+    listed,
     new_particles,
     place_of,
     prune,
-    room,
-    rows_at_once,
     settle,
     share_out,
-    start,
-    used,
     write,
 )
 from mbagent.types import Floats, Ints, Keys
@@ -234,9 +231,8 @@ def log_prob_causal(
 
 
 @compiled
-def _independent(probs: Floats, outputs: Ints, grid: Grid) -> Found:
+def _independent(probs: Floats, outputs: Ints, p: Particles, grid: Grid, out: Outcomes) -> int:
     n_rows, n_outputs, n_grid = probs.shape[0], probs.shape[1], grid[0]
-    p, found = new_particles(n_grid, n_outputs, probs.shape[2]), room(n_rows, n_grid, n_outputs)
     base, still_open = np.empty(n_outputs, dtype=np.int64), np.empty(n_outputs, dtype=np.int64)
     values = np.empty(probs.shape[2], dtype=np.float64)
     total = 0
@@ -253,9 +249,9 @@ def _independent(probs: Floats, outputs: Ints, grid: Grid) -> Found:
             still_open[n_open] = i
             share_out(p, -1, i, n_open, values, outputs[i], i == n_outputs - 1, grid)
             n_open += 1
-        found[0][b] = write(p, base, still_open, n_open, n_grid, total, found)
-        total += found[0][b]
-    return used(found, total)
+        out.counts[b] = write(p, base, still_open, n_open, n_grid, total, out)
+        total += out.counts[b]
+    return total
 
 
 @compiled
@@ -282,10 +278,11 @@ def _causal(
     layout: Layout,
     group: GroupWeights,
     certain: float,
+    p: Particles,
     grid: Grid,
-) -> Found:
+    out: Outcomes,
+) -> int:
     n_outputs, n_grid = probs.shape[1], grid[0]
-    p, found = new_particles(n_grid, n_outputs, probs.shape[2]), room(len(states), n_grid, n_outputs)
     base, still_open, columns = np.empty((3, n_outputs), dtype=np.int64)
     active = np.empty(n_outputs + layout.n_steps, dtype=np.int64)
     sums = np.empty((2, group.bias.shape[1]), dtype=np.float32)  # shared by all particles; of one particle
@@ -321,9 +318,9 @@ def _causal(
                 prune(values, n)
                 share_out(p, slot, i, n_open, values, n, i == n_outputs - 1, grid)
             n_open += 1
-        found[0][b] = write(p, base, still_open, n_open, n_grid, total, found)
-        total += found[0][b]
-    return used(found, total)
+        out.counts[b] = write(p, base, still_open, n_open, n_grid, total, out)
+        total += out.counts[b]
+    return total
 
 
 @compiled
@@ -364,11 +361,12 @@ def independent_successors(probs: Floats, outputs: Ints, n_samples: int, seed: i
         n_samples: grid points n per row.
         seed: seed of the grid's offset and of new random numbers.
     """
-    key, offset = start(seed)
-    step = rows_at_once(n_samples, len(outputs))
-    grid = (n_samples, key, offset)
-    parts = [_independent(probs[b : b + step], outputs, grid) for b in range(0, len(probs), step)]
-    return assemble(parts, len(outputs))
+    p = new_particles(n_samples, probs.shape[1], probs.shape[2])
+
+    def write_rows(rows: slice, grid: Grid, out: Outcomes) -> int:
+        return _independent(probs[rows], outputs, p, grid, out)
+
+    return listed(len(probs), n_samples, len(outputs), seed, write_rows)
 
 
 def causal_successors(
@@ -386,10 +384,9 @@ def causal_successors(
 
     Arguments as in ``sample_causal``; ``n_samples`` and ``seed`` as in ``independent_successors``.
     """
-    key, offset = start(seed)
-    step = rows_at_once(n_samples, len(layout.outputs))
-    parts = []
-    for b in range(0, len(states), step):
-        given = (states[b : b + step], actions[b : b + step], logits[b : b + step], probs[b : b + step])
-        parts.append(_causal(*given, layout, group, certain, (n_samples, key, offset)))
-    return assemble(parts, len(layout.outputs))
+    p = new_particles(n_samples, probs.shape[1], probs.shape[2])
+
+    def write_rows(rows: slice, grid: Grid, out: Outcomes) -> int:
+        return _causal(states[rows], actions[rows], logits[rows], probs[rows], layout, group, certain, p, grid, out)
+
+    return listed(len(states), n_samples, len(layout.outputs), seed, write_rows)

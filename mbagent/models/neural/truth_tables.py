@@ -17,9 +17,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mbagent.models.kernel import Outcomes, work_for
 from mbagent.models.neural.networks import ACTIVATIONS, Affine, Conditioner, DensePredictor
 from mbagent.models.neural.training import Examples
-from mbagent.models.overloads import Outcomes, implements, outcomes, work_for
 from mbagent.models.systematic_sampling import (
     MAIN,
     MASS,
@@ -36,8 +36,9 @@ from mbagent.models.systematic_sampling import (
     weigh,
 )
 from mbagent.types import Floats, Ints, Keys
-from mbagent_envs.jit import borrowed, compiled, inlined
+from mbagent_envs.jit import compiled, inlined
 from mbagent_envs.random_keys import uniform_at
+from mbagent_envs.structs import Struct
 
 MOST_PARENTS = 12
 """Largest number of parents of a table, which then has two to this power entries for each action."""
@@ -231,25 +232,6 @@ class Table(NamedTuple):
         return Table(tuple(bits[:n_states]), tuple(bits[n_states:]), chances)
 
 
-class BitRules(NamedTuple):
-    """Tables of all outcome bits.
-
-    Attributes:
-        table: probabilities of all tables, concatenated.
-        bits: a row for each outcome bit that is not a copy, in order, int64 [R, 6]: the bit; the start of its table; the offset
-            of the next action's table; the start of its parents in the state, their start in the outcome, and their end.
-        parents: parents of all tables, int64.
-        copies: a row for each other bit, int64 [O - R, 4]: the bit; a bit of the state; its value if that bit is 0; if it is 1.
-        n_actions: A.
-    """
-
-    table: Floats
-    bits: Ints
-    parents: Ints
-    copies: Ints
-    n_actions: int
-
-
 def compile_rules(tables: Sequence[Table], n_actions: int, settled: bool = False) -> BitRules:
     """Combines the tables, one for each outcome bit, to rules.
 
@@ -306,8 +288,7 @@ def settled_chance(one: float) -> float:
 @compiled
 def sample_rules(states: Ints, actions: Ints, keys: Keys, rules: BitRules) -> tuple[Ints, NDArray[np.bool_]]:
     """Samples next states int64 [B, F] and ``terminated`` bool [B]: bit i of row b uses number i of key b, as in ``sampling``."""
-    n_bits, k = states.shape[1], borrowed(rules)
-    table, bits, parents, copies = k.table, k.bits, k.parents, k.copies
+    n_bits, table, bits, parents, copies = states.shape[1], rules.table, rules.bits, rules.parents, rules.copies
     drawn, ended = np.empty_like(states), np.zeros(len(states), dtype=np.bool_)
     outcome = np.zeros(n_bits + 1, dtype=np.int64)
     for b in range(len(states)):
@@ -328,7 +309,7 @@ def sample_rules(states: Ints, actions: Ints, keys: Keys, rules: BitRules) -> tu
     return drawn, ended
 
 
-class RulesWork(NamedTuple):
+class RulesWork(Struct):
     """Work space.
 
     Attributes:
@@ -342,19 +323,6 @@ class RulesWork(NamedTuple):
     open: Ints
     slot: Ints
     p: Particles
-
-
-@implements(work_for, BitRules)
-@compiled
-def rules_work(k: BitRules, n_grid: int) -> RulesWork:
-    """See ``models.overloads``."""
-    n_outputs = len(k.bits) + len(k.copies)
-    return RulesWork(
-        np.empty(n_outputs, dtype=np.int64),
-        np.empty(n_outputs, dtype=np.int64),
-        np.empty(n_outputs, dtype=np.int64),
-        new_particles(n_grid, n_outputs, 2),
-    )
 
 
 @inlined
@@ -385,10 +353,9 @@ def _write_outcomes(total: int, base: Ints, still_open: Ints, p: Particles, n_gr
     return n_outcomes(p)
 
 
-@implements(outcomes, BitRules)
 @compiled
 def rules_outcomes(k: BitRules, work: RulesWork, state: Ints, n_grid: int, key: np.uint64, offset: float, out: Outcomes) -> int:
-    """See ``models.overloads``."""
+    """See ``models.kernel``."""
     table, bits, parents, base, slot = k.table, k.bits, k.parents, work.base, work.slot
     grid, total, still_open, p = (n_grid, key, offset), 0, work.open, work.p
     factors, values = p.factors, np.empty(2, dtype=np.float64)
@@ -422,3 +389,36 @@ def rules_outcomes(k: BitRules, work: RulesWork, state: Ints, n_grid: int, key: 
         out.left_out[action] = p.left[0]
         total += out.counts[action]
     return total
+
+
+class BitRules(Struct):
+    """Tables of all outcome bits.
+
+    Attributes:
+        table: probabilities of all tables, concatenated.
+        bits: a row for each outcome bit that is not a copy, in order, int64 [R, 6]: the bit; the start of its table; the offset
+            of the next action's table; the start of its parents in the state, their start in the outcome, and their end.
+        parents: parents of all tables, int64.
+        copies: a row for each other bit, int64 [O - R, 4]: the bit; a bit of the state; its value if that bit is 0; if it is 1.
+        n_actions: A.
+    """
+
+    table: Floats
+    bits: Ints
+    parents: Ints
+    copies: Ints
+    n_actions: int
+
+    outcomes = staticmethod(rules_outcomes)
+
+
+@work_for.register
+def rules_work(k: BitRules, n_grid: int) -> RulesWork:
+    """See ``models.kernel``."""
+    n_outputs = len(k.bits) + len(k.copies)
+    return RulesWork(
+        np.empty(n_outputs, dtype=np.int64),
+        np.empty(n_outputs, dtype=np.int64),
+        np.empty(n_outputs, dtype=np.int64),
+        new_particles(n_grid, n_outputs, 2),
+    )

@@ -17,7 +17,17 @@ import numpy as np
 from mbagent.models.mdp import GraphArrays, StateGraph
 from mbagent.planning.lookahead import grow_lookahead
 from mbagent.planning.planners import Expanded, ValueIterationPlanner
-from mbagent.planning.value_iteration import LOWEST_KNOWN, TOLERANCE, Values, bellman, break_ties, score_edges, settle, sweep
+from mbagent.planning.value_iteration import (
+    LOWEST_KNOWN,
+    TOLERANCE,
+    LeafValues,
+    Values,
+    bellman,
+    break_ties,
+    score_edges,
+    settle,
+    sweep,
+)
 from mbagent.types import Floats, Ints, States
 from mbagent_envs.jit import borrowed, compiled, inlined
 from mbagent_envs.random_keys import derive, derive_one, mix
@@ -131,7 +141,7 @@ class GraphSearch(ValueIterationPlanner):
         tables = _lengthened(tables, len(graph.arrays.tags), len(graph.arrays.sources))
         tables.rewards[n_edges : graph.n_edges] = score_edges(graph, self._known_goal(), n_edges)
         weigh(graph.arrays, tables, self.settings.gamma, n_edges)
-        take_in(graph.arrays, tables, self.settings.gamma, leaves, n_nodes)
+        take_in(graph.arrays, tables, self.settings.gamma, leaves, n_nodes, LOWEST_KNOWN)
         return tables
 
 
@@ -187,7 +197,7 @@ def measure_spans(graph: GraphArrays, tables: Tables) -> None:
 
 
 @compiled
-def take_in(graph: GraphArrays, tables: Tables, gamma: float, leaves: Ints, n_before: int) -> None:
+def take_in(graph: GraphArrays, tables: Tables, gamma: float, leaves: Ints, n_before: int, leaf: LeafValues) -> None:
     """Initialises values of the expanded ``leaves`` and of the nodes from number ``n_before`` on, then sweeps their groups."""
     n, m = graph.sizes[0], graph.sizes[1]
     v, q, rewards, active = tables.v[:n], tables.q[:n], tables.rewards[:m], np.zeros(len(tables.frontier), dtype=np.bool_)
@@ -198,7 +208,7 @@ def take_in(graph: GraphArrays, tables: Tables, gamma: float, leaves: Ints, n_be
         tables.met[node] = 0
         v[node] = bellman(node, graph, rewards, gamma, v, q)
         active[graph.groups[node]] = True
-    sweep(graph, rewards, gamma, TOLERANCE, GROWING_SWEEPS, active, v, q, tables.frontier, LOWEST_KNOWN)
+    sweep(graph, rewards, gamma, TOLERANCE, GROWING_SWEEPS, active, v, q, tables.frontier, leaf)
     measure_spans(graph, tables)
 
 

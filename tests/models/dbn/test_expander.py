@@ -69,7 +69,7 @@ def test_affected_variables_are_used_if_only_the_end_is_synchronic() -> None:
     model, _ = of_walker()
     kernel = model.kernel()
     assert isinstance(kernel, AffectedIndex)
-    assert len(kernel.end_first) == 2
+    assert len(kernel.synchronic.changing) == 1
     assert len(model.fitted.synchronic.changing) == 1
 
 

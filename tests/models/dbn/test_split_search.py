@@ -12,8 +12,8 @@ from mbagent.models.dbn.score import (
     Target,
     best_split,
     count,
-    evidence,
     evidence_tables,
+    evidences,
     feature_blocks,
 )
 from mbagent.models.dbn.split_search import find_splits
@@ -41,7 +41,7 @@ def test_evidence_is_the_marginal_likelihood_under_a_beta_prior() -> None:
     tables = evidence_tables(40)
     for positives, n in ((0, 0), (0, 7), (3, 7), (40, 40)):
         exact = special.betaln(positives + 0.2, n - positives + 0.2) - special.betaln(0.2, 0.2)
-        assert evidence(positives, n, *tables) == pytest.approx(exact)
+        assert evidences(np.array([positives]), np.array([n]), tables)[0] == pytest.approx(exact)
 
 
 def test_gain_of_the_best_split_agrees_with_direct_computation() -> None:
@@ -53,7 +53,7 @@ def test_gain_of_the_best_split_agrees_with_direct_computation() -> None:
     chosen = best_split(one, count(one, feature_blocks(table)), np.full(6, -2.0), np.array([-50.0, -50.0, -3.0]), tables)
 
     def total(rows: np.ndarray) -> float:
-        return float(evidence(int(positives[rows].sum()), int(rows.sum()), *tables))
+        return float(evidences(positives[rows].sum(keepdims=True), np.array([rows.sum()]), tables)[0])
 
     before = [total(context == c) for c in range(3)]
     gains = {}

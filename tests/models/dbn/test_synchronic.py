@@ -156,7 +156,7 @@ def test_probabilities_beside_a_constant_factor_do_not_depend_on_what_memory_hel
     model, rows = DecisionGraphModel((2, 1, 2, 3), 2), dataset((2, 1, 2, 3), 2, states, actions, following, ends)
     model.fit(rows)
     layout, graphs, batch = model.fitted.layout, model.fitted.usual, rows.rows()
-    clean, empty = fitting.probabilities(layout, graphs, batch), np.empty
+    clean = fitting.probabilities(layout, graphs, batch)
     with monkeypatch.context() as patch:
-        patch.setattr(np, "empty", lambda shape, dtype=np.float64: empty(shape, dtype) + np.inf)
+        patch.setattr(np, "empty", lambda shape, dtype=np.float64: np.full(shape, np.inf if dtype == np.float64 else 1, dtype))
         np.testing.assert_array_equal(fitting.probabilities(layout, graphs, batch), clean)

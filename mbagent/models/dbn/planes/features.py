@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbagent.data import Factors
-from mbagent.models.dbn.arrays import Graphs, linked, n_features
+from mbagent.models.dbn.arrays import FEATURE, NODE, OFF, ON, Graphs, linked, n_features
 from mbagent.models.dbn.features import BEYOND, ActionEncoding, Layout, action_features, layout_with_mutexes, make_layout
-from mbagent.models.dbn.planes.invariants import NO_INVARIANTS, Invariants, radix
+from mbagent.models.dbn.planes.invariants import NO_INVARIANTS, Invariants, radix, with_invariants
 from mbagent.spaces import PlaneLayout
 from mbagent.types import Bools, Ints
 from mbagent_envs.jit import compiled
@@ -364,28 +364,23 @@ class LocalGraphs:
 def instantiate(local: LocalGraphs, board: PlaneLayout) -> tuple[Layout, Graphs, Graphs]:
     """Layout, graphs and synchronic graphs for a board."""
     n_factors = board.channels * board.height * board.width
-    cells = board.to_planes(np.arange(n_factors)[None])[0]
+    cells = np.ascontiguousarray(board.to_planes(np.arange(n_factors)[None])[0])
     cardinalities = np.empty(n_factors, dtype=np.int64)
     for channel, values in enumerate(local.cardinalities):
         cardinalities[cells[channel]] = values
-    tested = np.concatenate([local.graphs.feature, local.synchronic.feature])
+    tested = np.concatenate([local.graphs.node[:, FEATURE], local.synchronic.node[:, FEATURE]])
     used = np.unique(tested[tested >= 0])
     adjacencies, later = (used[local.features[used, 0] == kind] for kind in (ADJACENCY, NEXT_ADJACENCY))
     layout = make_layout([int(c) for c in cardinalities], (), local.encoding, ordinal=False)
     now, then = (np.ascontiguousarray(local.features[numbers, 1:]) for numbers in (adjacencies, later))
-    layout = layout._replace(cells=cells, adjacencies=now, next_adjacencies=then, weights=radix(local.cardinalities))
+    layout = replace(layout, cells=cells, adjacencies=now, next_adjacencies=then, weights=radix(local.cardinalities))
     layout = with_mutexes(with_invariants(layout, local.invariants), local.mutexes)
     numbers = {int(d): len(layout.factor) + layout.encoding.n_features + i for i, d in enumerate(adjacencies)}
     numbers |= {int(d): n_features(layout) + len(layout.factor) + i for i, d in enumerate(later)}
     graphs, synchronic = (_Board(local, layout, numbers).graphs(which) for which in (local.graphs, local.synchronic))
     variables = [layout.cells[c].ravel() if c < len(cells) else np.asarray([n_factors]) for c in local.synchronic.changing]
     order = np.concatenate([*variables, np.zeros(0, dtype=np.int64)])
-    return layout, graphs, synchronic._replace(changing=order[layout.mutex_of[order] < 0])
-
-
-def with_invariants(layout: Layout, invariants: Invariants) -> Layout:
-    """The layout with the given invariants."""
-    return layout._replace(counts=invariants.counts, observed=invariants.observed)
+    return layout, graphs, replace(synchronic, changing=order[layout.mutex_of[order] < 0])
 
 
 def with_mutexes(layout: Layout, mutexes: Sequence[Mutex]) -> Layout:
@@ -421,7 +416,7 @@ class _Board:
         local, layout, self.relative = self.local, self.layout, graphs
         _, height, width = layout.cells.shape
         pairs = np.concatenate([[0], np.cumsum(layout.encoding.n_action_classes * layout.outputs)]).astype(np.int64)
-        shared = {int(node): self._add(-1, 0, 0, int(node)) for node in np.flatnonzero(graphs.feature < 0)}
+        shared = {int(node): self._add(-1, 0, 0, int(node)) for node in np.flatnonzero(graphs.node[:, FEATURE] < 0)}
         channel_of = np.full(len(layout.outputs), len(local.cardinalities))
         entries: list[tuple[int, int, int]] = []
         for channel in graphs.changing:
@@ -443,10 +438,8 @@ class _Board:
             changing.astype(np.int64),
             pairs,
             *linked(entries, int(pairs[-1]), self.links),
-            np.where(leaves >= 0, graphs.rate[leaves], 0.0),
-            np.where(leaves >= 0, graphs.spread[leaves], 0.0),
-            np.concatenate([graphs.persistence[graphs.pairs[c] : graphs.pairs[c + 1]] for c in channel_of]),
-            np.concatenate([graphs.unseen_mass[graphs.pairs[c] : graphs.pairs[c + 1]] for c in channel_of]),
+            np.where(leaves[:, None] >= 0, graphs.leaf[leaves], 0.0),
+            np.concatenate([graphs.smoothing[graphs.pairs[c] : graphs.pairs[c + 1]] for c in channel_of]),
             np.concatenate([[0], np.cumsum(layout.outputs)]).astype(np.int64),
             np.concatenate([graphs.base[graphs.start[c] : graphs.start[c + 1]] for c in channel_of]),
             graphs.still,
@@ -463,20 +456,20 @@ class _Board:
         graphs = self.relative
         begin, end = graphs.entries[graphs.pairs[channel]], graphs.entries[graphs.pairs[channel + 1]]
         found: set[int] = set()
-        stack = [int(node) for node in graphs.nodes[begin:end]]
+        stack = graphs.entry[begin:end, NODE].tolist()
         while stack:
             node = stack.pop()
-            if node not in found and graphs.feature[node] >= 0:
+            if node not in found and graphs.node[node, FEATURE] >= 0:
                 found.add(node)
-                stack += [int(graphs.off[node]), int(graphs.on[node])]
+                stack += graphs.node[node, [OFF, ON]].tolist()
         return sorted(found)
 
     def _copy(self, nodes: Sequence[int], shared: dict[int, int], y: int, x: int) -> dict[int, int]:
         """Nodes for a position; tests whose result the border determines are resolved."""
         graphs, copies = self.relative, dict(shared)
         for node in nodes:
-            off, on = copies[int(graphs.off[node])], copies[int(graphs.on[node])]
-            feature = self._absolute(int(graphs.feature[node]), y, x)
+            relative, off, on = graphs.node[node].tolist()
+            off, on, feature = copies[off], copies[on], self._absolute(relative, y, x)
             copies[node] = off if feature == _NEVER or off == on else on if feature == _ALWAYS else self._add(feature, off, on)
         return copies
 
@@ -504,9 +497,9 @@ class _Board:
         graphs = self.relative
         first, last = graphs.pairs[channel], graphs.pairs[channel + 1]
         return [
-            (begin + int(pair - first), int(graphs.values[entry]), copies[int(graphs.nodes[entry])])
+            (begin + int(pair - first), int(value), copies[int(node)])
             for pair in range(first, last)
-            for entry in range(graphs.entries[pair], graphs.entries[pair + 1])
+            for value, node in graphs.entry[graphs.entries[pair] : graphs.entries[pair + 1]]
         ]
 
 

@@ -10,11 +10,14 @@ Shapes: K counts, C channels, P combinations of values.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from mbagent.data import TransitionBatch
+from mbagent.models.dbn.features import Layout
+from mbagent.models.kernel import Outcomes
 from mbagent.models.protocol import Successors
 from mbagent.models.systematic_sampling import RARE_VALUE
 from mbagent.spaces import PlaneLayout
@@ -117,15 +120,26 @@ def _find_observed(rows: TransitionBatch, board: PlaneLayout, cardinalities: Seq
     return times > 0 if (times == 1).sum() <= RARELY_NEW * len(rows) and (times == 0).any() else NO_INVARIANTS.observed
 
 
+def with_invariants(layout: Layout, invariants: Invariants) -> Layout:
+    """The layout with the given invariants."""
+    return replace(layout, counts=invariants.counts, observed=invariants.observed)
+
+
+def has_invariants(layout: Layout) -> bool:
+    """Whether a layout has invariants."""
+    return len(layout.counts) > 0 or len(layout.observed) > 0
+
+
 @compiled
-def keeps(counts: Ints, observed: Bools, weights: Ints, cells: Ints, state: Ints, following: Ints) -> bool:
+def keeps(layout: Layout, state: Ints, following: Ints) -> bool:
     """Whether a next state [F] satisfies all invariants; its counts must be those of the current state."""
+    counts, observed, cells = layout.counts, layout.observed, layout.cells
     n_channels, height, width = cells.shape
     for k in range(len(counts)):
-        here, value, surplus = cells[counts[k, 0]], counts[k, 1], 0
+        channel, value, surplus = counts[k, 0], counts[k, 1], 0
         for y in range(height):
             for x in range(width):
-                surplus += int(following[here[y, x]] == value) - int(state[here[y, x]] == value)
+                surplus += int(following[cells[channel, y, x]] == value) - int(state[cells[channel, y, x]] == value)
         if surplus != 0:
             return False
     if len(observed):
@@ -133,34 +147,23 @@ def keeps(counts: Ints, observed: Bools, weights: Ints, cells: Ints, state: Ints
             for x in range(width):
                 code = 0
                 for c in range(n_channels):
-                    code += weights[c] * following[cells[c, y, x]]
+                    code += layout.weights[c] * following[cells[c, y, x]]
                 if not observed[code]:
                     return False
     return True
 
 
 @compiled
-def all_kept(counts: Ints, observed: Bools, weights: Ints, cells: Ints, states: Ints, following: Ints) -> Bools:
+def all_kept(layout: Layout, states: Ints, following: Ints) -> Bools:
     """``keeps`` for rows, bool [B]."""
     result = np.empty(len(states), dtype=np.bool_)
     for b in range(len(states)):
-        result[b] = keeps(counts, observed, weights, cells, states[b], following[b])
+        result[b] = keeps(layout, states[b], following[b])
     return result
 
 
 @compiled
-def leave_out(
-    counts: Ints,
-    observed: Bools,
-    weights: Ints,
-    cells: Ints,
-    state: Ints,
-    following: Ints,
-    terminated: Bools,
-    probabilities: Floats,
-    first: int,
-    n: int,
-) -> int:
+def leave_out(layout: Layout, state: Ints, first: int, n: int, out: Outcomes) -> int:
     """Removes non-terminal outcomes among ``first`` to ``first + n`` that violate an invariant; returns how many are left.
 
     Works in place. The other non-terminal outcomes are renormalised. If these have less than ``RARE_VALUE`` of the non-terminal
@@ -168,62 +171,51 @@ def leave_out(
     """
     kept, removed = 0.0, 0.0
     for q in range(first, first + n):
-        if not terminated[q]:
-            if keeps(counts, observed, weights, cells, state, following[q]):
-                kept += probabilities[q]
+        if not out.terminated[q]:
+            if keeps(layout, state, out.states[q]):
+                kept += out.probabilities[q]
             else:
-                removed += probabilities[q]
+                removed += out.probabilities[q]
     if removed == 0.0 or kept < RARE_VALUE * (kept + removed):
         return n
     left = first
     for q in range(first, first + n):
-        over = terminated[q]
-        if over or keeps(counts, observed, weights, cells, state, following[q]):
-            following[left] = following[q]
-            terminated[left] = over
-            probabilities[left] = probabilities[q] if over else probabilities[q] * (kept + removed) / kept
+        over, probability = out.terminated[q], out.probabilities[q]
+        if over or keeps(layout, state, out.states[q]):
+            for f in range(len(state)):
+                out.states[left, f] = out.states[q, f]
+            out.terminated[left] = over
+            out.probabilities[left] = probability if over else probability * (kept + removed) / kept
             left += 1
     return left - first
 
 
 @compiled
-def leave_out_all(
-    counts: Ints,
-    observed: Bools,
-    weights: Ints,
-    cells: Ints,
-    states: Ints,
-    offsets: Ints,
-    following: Ints,
-    over: Bools,
-    chances: Floats,
-) -> Ints:
-    """``leave_out`` for every row, in place; returns how many outcomes each has left."""
-    left = np.empty(len(states), dtype=np.int64)
+def _leave_out_all(layout: Layout, states: Ints, offsets: Ints, out: Outcomes) -> None:
+    """``leave_out`` for every row, in place; writes how many outcomes each has left to ``out.counts`` [B]."""
     for b in range(len(states)):
-        n = offsets[b + 1] - offsets[b]
-        left[b] = leave_out(counts, observed, weights, cells, states[b], following, over, chances, offsets[b], n)
-    return left
+        out.counts[b] = leave_out(layout, states[b], offsets[b], offsets[b + 1] - offsets[b], out)
 
 
-def enforced(invariants: Invariants, weights: Ints, cells: Ints, states: Ints, found: Successors) -> Successors:
+def enforced(layout: Layout, states: Ints, found: Successors) -> Successors:
     """Successors of states [B, F] without those that violate an invariant."""
-    if invariants.none or len(states) == 0:
+    if not has_invariants(layout) or len(states) == 0:
         return found
-    following, over, chances = found.states.copy(), found.terminated.copy(), found.probabilities.copy()
-    left = leave_out_all(*invariants, weights, cells, states, found.offsets, following, over, chances)
+    counts = np.empty(len(states), dtype=np.int64)
+    out = Outcomes(counts, found.states.copy(), found.terminated.copy(), found.probabilities.copy(), np.zeros(len(states)))
+    _leave_out_all(layout, states, found.offsets, out)
     sizes = np.diff(found.offsets)
-    kept = np.arange(len(over)) - np.repeat(found.offsets[:-1], sizes) < np.repeat(left, sizes)
-    offsets = np.concatenate([[0], np.cumsum(left)]).astype(np.int64)
-    return Successors(offsets, following[kept], over[kept], chances[kept])
+    kept = np.arange(len(out.terminated)) - np.repeat(found.offsets[:-1], sizes) < np.repeat(counts, sizes)
+    offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return Successors(offsets, out.states[kept], out.terminated[kept], out.probabilities[kept])
 
 
-def kept_chances(invariants: Invariants, weights: Ints, cells: Ints, states: Ints, found: Successors) -> Floats:
+def kept_chances(layout: Layout, states: Ints, found: Successors) -> Floats:
     """Probability, for each row of successors, that a non-terminal outcome satisfies all invariants, [B].
 
     It is 1 if none satisfies them, or if all outcomes are terminal.
     """
     rows, on = found.rows, ~found.terminated
-    kept = all_kept(*invariants, weights, cells, states[rows], found.states)
+    kept = all_kept(layout, states[rows], found.states)
     total, good = (np.bincount(rows, weights=found.probabilities * which, minlength=len(states)) for which in (on, on & kept))
     return np.where(good > 0.0, good / np.where(total > 0.0, total, 1.0), 1.0)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.models.dbn import sampling
-from mbagent.models.dbn.arrays import SAVED, Graphs, build, from_arrays, table_of, to_arrays
+from mbagent.models.dbn.arrays import FEATURE, SAVED, Graphs, build, from_arrays, table_of, to_arrays
 from mbagent.models.dbn.change_points import last_changes
 from mbagent.models.dbn.effects import smoothing_of
 from mbagent.models.dbn.features import Layout, Observed, Question, ask, distinct
@@ -36,10 +36,16 @@ from mbagent.models.dbn.planes.features import (
     instantiate,
     relative_features,
     shifted,
-    with_invariants,
     with_mutexes,
 )
-from mbagent.models.dbn.planes.invariants import NO_INVARIANTS, Invariants, all_kept, find_invariants, n_combinations
+from mbagent.models.dbn.planes.invariants import (
+    NO_INVARIANTS,
+    Invariants,
+    all_kept,
+    find_invariants,
+    n_combinations,
+    with_invariants,
+)
 from mbagent.models.dbn.planes.large_data import PlaneTable, channel_layout, refine
 from mbagent.models.dbn.score import Search
 from mbagent.models.fit_report import FitReport, Variable
@@ -121,7 +127,7 @@ def fit_synchronic(planes: PlaneTable, layout: Layout, graphs: Graphs) -> tuple[
     if not synchronic:
         return no_synchronic(graphs), [], []
     built = planes.build(all_questions, found)
-    return built._replace(changing=np.asarray(synchronic, dtype=np.int64)), all_questions, found
+    return replace(built, changing=np.asarray(synchronic, dtype=np.int64)), all_questions, found
 
 
 def _dependent(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[int, Ints]:
@@ -158,8 +164,7 @@ def _errors(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[tuple[in
     for channel, k in enumerate(planes.cardinalities):
         cards[layout.cells[channel]] = k
     start = np.concatenate([[0], np.cumsum(cards)]).astype(np.int64)
-    probs = np.empty((n, int(start[-1])))
-    sampling.marginals(rows.states, rows.actions, layout, graphs, start, probs)
+    probs = sampling.marginals(rows.states, rows.actions, layout, graphs, start)
     found = {}
     for channel, k in enumerate(planes.cardinalities):
         ungrouped = layout.mutex_of[layout.cells[channel]] < 0
@@ -275,7 +280,7 @@ class LocalGraphModel(DecisionGraphModel):
         self._enforce_invariants(rows)
         if progress is not None:
             progress(1.0)
-        figures = {"nodes": float(len(self.local.graphs.feature)), "couplings": float(len(self.local.mutexes))}
+        figures = {"nodes": float(len(self.local.graphs.node)), "couplings": float(len(self.local.mutexes))}
         figures |= {"changed": float((since > 0).sum()), "searched": float(self.searched)}
         figures["left out"] = float(len(rows) - self.counted)
         report = self._report((len(rows), len(held_out)), likelihood, exact, figures)
@@ -373,11 +378,12 @@ class LocalGraphModel(DecisionGraphModel):
         )
         each = [*(NO_INVARIANTS._replace(counts=invariants.counts[k : k + 1]) for k in range(len(invariants.counts)))]
         each += [NO_INVARIANTS._replace(observed=invariants.observed)]
+        layouts = [with_invariants(layout, invariant) for invariant in each]
         violated, states = np.zeros(len(each), dtype=np.bool_), thinned(rows, SOME_ROWS).states
         for _ in range(0 if invariants.none else SIMULATED_STEPS):
             following, over = self.sample(states, rng.integers(self.n_actions, size=len(states)), rng)
-            for i, invariant in enumerate(each):
-                violated[i] |= not (over | all_kept(*invariant, layout.weights, layout.cells, states, following)).all()
+            for i, alone in enumerate(layouts):
+                violated[i] |= not (over | all_kept(alone, states, following)).all()
             states = following[~over]
         invariants = Invariants(invariants.counts[violated[:-1]], invariants.observed if violated[-1] else NO_INVARIANTS.observed)
         self.local = replace(self.local, invariants=invariants)
@@ -470,7 +476,7 @@ def channel_cardinalities(space: FactoredSpace) -> tuple[int, ...] | None:
 
 def _sound(graphs: Graphs, synchronic: Graphs, features: Ints) -> bool:
     """Whether only synchronic graphs test the next state."""
-    tested = graphs.feature[graphs.feature >= 0]
+    tested = graphs.node[graphs.node[:, FEATURE] >= 0, FEATURE]
     channels = features[features[:, 0] == NEXT, 1]
     return bool(
         not np.isin(features[tested, 0], (NEXT, NEXT_ADJACENCY)).any() and (synchronic.changing <= channels.max() + 1).all()

@@ -1,11 +1,22 @@
 """Invariants of planes: which are found, which outcomes are removed, and that no sample violates them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from gymnasium import spaces
 
 from mbagent.models.dbn import LocalGraphModel
-from mbagent.models.dbn.planes.invariants import NO_INVARIANTS, Invariants, all_kept, enforced, find_invariants, radix
+from mbagent.models.dbn.features import action_encoding, make_layout
+from mbagent.models.dbn.planes.invariants import (
+    NO_INVARIANTS,
+    Invariants,
+    all_kept,
+    enforced,
+    find_invariants,
+    radix,
+    with_invariants,
+)
 from mbagent.models.protocol import Successors
 from mbagent.spaces import FactoredSpace
 from tests.models.helpers import dataset
@@ -73,17 +84,20 @@ def test_combinations_are_no_invariant_while_new_ones_are_observed() -> None:
 
 def test_outcomes_that_violate_an_invariant_are_removed_and_others_renormalised() -> None:
     cells, weights = np.arange(2).reshape(1, 1, 2), radix((3,))
+    layout = replace(make_layout((3, 3), (), action_encoding((1,))), cells=cells, weights=weights)
     invariants = NO_INVARIANTS._replace(counts=np.array([[0, 1]]))
     states = np.array([[1, 0], [0, 0]])
     following = np.array([[1, 0], [0, 1], [1, 1], [0, 0], [0, 0], [1, 0]])
     over = np.array([False, False, False, True, False, False])
     found = Successors(np.array([0, 4, 6]), following, over, np.array([0.1, 0.3, 0.4, 0.2, 0.5, 0.5]))
-    kept = enforced(invariants, weights, cells, states, found)
+    kept = enforced(with_invariants(layout, invariants), states, found)
     np.testing.assert_array_equal(kept.offsets, [0, 3, 4])
     np.testing.assert_array_equal(kept.states, [[1, 0], [0, 1], [0, 0], [0, 0]])
     np.testing.assert_allclose(kept.probabilities, [0.2, 0.6, 0.2, 1.0])
     impossible = invariants._replace(observed=np.array([False, False, True]))
-    assert len(enforced(impossible, weights, cells, states, found).states) == 6  # no outcome satisfies it: none is removed
+    assert (
+        len(enforced(with_invariants(layout, impossible), states, found).states) == 6
+    )  # no outcome satisfies it: none is removed
 
 
 def test_samples_satisfy_the_invariants_and_probabilities_take_them_into_account() -> None:
@@ -92,10 +106,10 @@ def test_samples_satisfy_the_invariants_and_probabilities_take_them_into_account
     assert len(layout.counts) > 0
     some, actions = states[:400], rng.integers(2, size=400)
     drawn, over = model.sample(some, actions, rng)
-    assert all_kept(layout.counts, layout.observed, layout.weights, layout.cells, some, drawn)[~over].all()
+    assert all_kept(layout, some, drawn)[~over].all()
     found = model.successors(some[:50], actions[:50], 256, 0)
     rows, on = found.rows, ~found.terminated
-    assert all_kept(layout.counts, layout.observed, layout.weights, layout.cells, some[rows], found.states)[on].all()
+    assert all_kept(layout, some[rows], found.states)[on].all()
     np.testing.assert_allclose(np.bincount(rows, weights=found.probabilities), 1.0)
     determined = np.exp(model.log_prob(some[rows], actions[rows], found.states, found.terminated))
     totals = np.bincount(rows, weights=determined)

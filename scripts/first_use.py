@@ -1,0 +1,70 @@
+"""Processor time of the first use on a fresh installation, which compiles; and of the import.
+
+python scripts/first_use.py                                # three environments, about two minutes
+python scripts/first_use.py FrozenLake-v1 --repetitions 5
+
+Each measurement is a new process with an empty folder for compiled functions. The import is compared with that of
+Stable-Baselines3.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+ENVIRONMENTS = ("mbagent/GeyserRunner-v0", "FrozenLake-v1", "mbagent/FlierCatcher-v0")
+
+LEARN = """
+import time, warnings
+warnings.simplefilter("ignore")
+import gymnasium as gym
+import mbagent
+began = time.process_time()
+env = gym.make({name!r})
+agent = mbagent.ModelLearningAgent("MctsPolicy", env, seed=0).learn(1000, log_interval=None)
+agent.predict(env.reset(seed=0)[0])
+print(time.process_time() - began)
+"""
+
+IMPORT = "import time; began = time.process_time(); import {name}; print(time.process_time() - began)"
+
+
+def seconds(code: str, folder: Path) -> float:
+    """What a program prints last, run in a new process with one thread and a folder for compiled functions."""
+    settings = {**os.environ, "NUMBA_CACHE_DIR": str(folder), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", code], env=settings, capture_output=True, text=True, check=True)
+    return float(done.stdout.split()[-1])
+
+
+def measure(name: str) -> float:
+    """Processor seconds of ``learn(1000)`` and ``predict`` in an environment, with an empty folder for compiled functions."""
+    with tempfile.TemporaryDirectory() as folder:
+        return seconds(LEARN.format(name=name), Path(folder))
+
+
+def main(environments: Annotated[tuple[str, ...], tyro.conf.Positional] = ENVIRONMENTS, repetitions: int = 1) -> None:
+    """Measures the first use and the import.
+
+    Args:
+        environments: ids of Gymnasium environments.
+        repetitions: measurements of each; the median is printed.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        ours, theirs = (
+            statistics.median(seconds(IMPORT.format(name=name), Path(folder)) for _ in range(3))
+            for name in ("mbagent", "stable_baselines3")
+        )
+    print(f"import mbagent: {ours:.1f} s, import stable_baselines3: {theirs:.1f} s", flush=True)
+    for name in environments:
+        print(f"{name}: {statistics.median(measure(name) for _ in range(repetitions)):.1f} s", flush=True)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
