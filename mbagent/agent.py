@@ -65,30 +65,30 @@ class ModelLearningAgent(EnvironmentAlgorithm):
     with the model (section 4) for the current goal: the environment's own reward, or the function given to ``set_reward``.
 
     Several threads may call ``predict``, ``explain``, ``set_reward``, ``save`` and ``get_parameters`` of one agent while
-    another thread is in ``learn``, ``prune`` or ``set_parameters``: calls wait for each other, and their results are those of a
-    single thread. To plan in parallel, give each thread or process a separate agent (``copy.deepcopy(agent)``).
+    another thread is in ``learn``, ``prune`` or ``set_parameters``: conflicting calls wait for each other, so results are
+    those of one call after the other. To plan in parallel, give each thread or process a copy (``copy.deepcopy(agent)``).
 
     Args:
         policy: the planner: "MctsPolicy" (also "MlpPolicy", "CnnPolicy", "MultiInputPolicy"), "FlatMonteCarloPolicy",
             "ValueIterationPolicy", or a subclass of PlannerPolicy.
         env: a Gymnasium environment, an SB3 VecEnv, or a registered id; its spaces must be discrete (see
             FactoredSpace).
-        learning_rate: largest rate of the fit's one-cycle schedule; a function of progress is evaluated at the start.
-        reward: the goal, see RewardFn; None for the environment's own.
+        learning_rate: peak of the fit's one-cycle schedule; of an SB3 schedule (a function), only the initial value is used.
+        reward: the reward function to plan for, see RewardFn; None for the environment's own.
         model: "auto" (at present "graphs": decision graphs fitted to data), "networks" (predictor and conditioner trained
             by gradient descent), "paper" (section 3's networks), "tabular", "direct" (see ``models.neural.forecasts``), another
             registered name, or a TransitionModel.
-        exploration: "auto" ("directed" while the relevant states are few, else "random"), "persistent", or an Exploration.
-        gamma: discount of a step when planning.
+        exploration: "directed", "random", "auto" (directed if there are few states), "persistent", or an Exploration.
+        gamma: discount factor per step in planning.
         num_simulations: simulations for each decision.
-        time_budget: seconds for each decision, instead of a number of simulations (see PlannerSettings), or None.
+        time_budget: seconds for each decision, replacing ``num_simulations`` (see PlannerSettings); None for no time budget.
         horizon: largest number of steps of a simulation.
         policy_kwargs: further PlannerSettings, by name.
         stats_window_size: number of episodes over which rollout statistics in the log are averaged.
         tensorboard_log: folder for TensorBoard.
-        verbose: 0 nothing, 1 the log, 2 more.
-        seed: seed of exploration, fit and planning; None draws one.
-        device: torch device ("auto" and "cpu" are the same: the networks are small).
+        verbose: 0 for no output, 1 for the log, 2 for more.
+        seed: seed for exploration, fitting and planning; None for a random seed.
+        device: torch device; "auto" means "cpu", since the networks are small.
 
     Raises:
         TypeError, ValueError: an unsupported space, an unknown name or a setting out of range; the message is one sentence.
@@ -155,7 +155,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
 
     @property
     def transitions(self) -> TransitionDataset:
-        """The observed transitions, in the model's factors."""
+        """The observed transitions, encoded in the model's factors."""
         return self.experience.coded(self.policy.factored)
 
     def _setup_model(self) -> None:
@@ -218,8 +218,8 @@ class ModelLearningAgent(EnvironmentAlgorithm):
 
         Raises:
             TypeError, ValueError: the function does not return one finite number per transition; the old goal is kept.
-            RuntimeError: the function raised an error (the cause of this one); the old goal is kept. ``predict`` also raises
-                this if the function fails for simulated transitions; planning for the next goal is not affected.
+            RuntimeError: the function raised an error, available as ``__cause__``; the old goal is kept. ``predict`` also raises
+                RuntimeError if the function fails for simulated transitions; this does not affect planning for goals set later.
         """
         with self.policy.lock:
             self.policy.set_goal(self.goals.choose(reward))
@@ -227,8 +227,8 @@ class ModelLearningAgent(EnvironmentAlgorithm):
     def explain(self, obs: Any, *, n_futures: int = 3, n_steps: int = 10) -> Explanation:
         """Explains the action that ``predict`` takes: each action's value, standard error, visits and most probable futures.
 
-        The result is reproducible, and later calls of ``predict`` are not affected. It takes about ten times as long as a first
-        decision. See Explanation for an example.
+        The result is reproducible, and later calls of ``predict`` are not affected. A call takes about ten times as long as the
+        first ``predict`` for a goal. See Explanation for an example.
 
         Args:
             obs: one observation.
@@ -258,12 +258,12 @@ class ModelLearningAgent(EnvironmentAlgorithm):
     ) -> Self:
         """Explores for ``total_timesteps`` steps, then fits the model to all transitions observed so far.
 
-        If a callback stops the run, the model is fitted to the steps taken until then. Further calls keep all transitions.
-        Since the fit happens at the end, callbacks that evaluate or save during the run use the agent as it was before: for a
-        learning curve, call ``learn`` several times with ``reset_num_timesteps=False``.
+        If a callback stops the run, the model is fitted to the steps taken until then. Later calls keep all earlier transitions.
+        Callbacks that evaluate or save the agent during the run see it as it was before the run, since the model is fitted only
+        at the end. For a learning curve, call ``learn`` several times with ``reset_num_timesteps=False``.
 
         Args:
-            total_timesteps: environment steps, over all copies of the environment; 0 only fits to earlier transitions.
+            total_timesteps: steps, summed over all parallel environments; 0 only fits the model to earlier transitions.
             callback: SB3 callbacks, called at every step.
             log_interval: iterations (of 1,000 steps) between two entries in the log; None for no log.
             tb_log_name: name of the run in TensorBoard.
@@ -271,11 +271,11 @@ class ModelLearningAgent(EnvironmentAlgorithm):
             progress_bar: whether to show a progress bar (needs ``pip install "mbagent[progress]"``).
 
         Raises:
-            TypeError, ValueError, ImportError: an argument is invalid; there is no environment, or nothing to fit to; or a
-                package for the progress bar is missing. No step is taken in these cases.
+            TypeError, ValueError, ImportError: an argument is invalid, there is no environment, there are no transitions to fit
+                to, or a package for the progress bar is missing. No step is taken in these cases.
             TypeError, ValueError: the environment returned values that do not match its declared spaces.
             RuntimeError: a process of a SubprocVecEnv has ended. After this or any other error the steps recorded so far are
-                kept: ``learn(0)`` fits to them without using the environment; ``learn`` with more steps begins with a reset.
+                kept: ``learn(0)`` fits to them without a step; after a failed step, ``learn`` begins with a reset.
         """
         if self.env is None:
             raise ValueError("learn() needs an environment; give one with set_env(env) or load(path, env=env).")
@@ -379,16 +379,16 @@ class ModelLearningAgent(EnvironmentAlgorithm):
     def prune(self, fraction: float, *, progress_bar: bool = False, config: PruningConfig | None = None) -> Self:
         """Removes the smallest weights of the model's networks and trains the remaining ones on the observed transitions.
 
-        Each network loses this share of its connections, and further ones that the transitions do not support; the goal
-        is kept. Repeated calls prune the remaining connections. ``learn`` fits again from scratch, with all connections.
+        Each network loses the share ``fraction`` of its connections, and others that the transitions do not support; the goal is
+        kept. Connections removed by earlier calls count towards ``fraction``; ``learn`` starts again with all connections.
 
         Args:
-            fraction: smallest share of the connections that are removed, in [0, 1).
+            fraction: minimum share of each network's connections to remove, in [0, 1).
             progress_bar: whether to show a progress bar.
-            config: see PruningConfig; ``PruningConfig(evidence=False)`` removes exactly this share.
+            config: see PruningConfig; with ``PruningConfig(evidence=False)``, exactly the share ``fraction`` is removed.
 
         Raises:
-            ValueError: a fraction out of range, nothing learned yet, or no transitions to train on (after ``load``).
+            ValueError: ``fraction`` is out of range, nothing is learned yet, or (as after ``load``) there are no transitions.
             TypeError: the model has no weights. After these or any other errors the agent is unchanged.
         """
         fraction = check_fraction(fraction)
@@ -513,10 +513,10 @@ class ModelLearningAgent(EnvironmentAlgorithm):
         Args:
             path: a path (".zip" is added if it has no suffix) or an open binary file.
             exclude: accepted for compatibility with SB3; ignored.
-            include: ``"transitions"``, or a list of it, adds the observed transitions.
+            include: ``"transitions"`` or ``["transitions"]`` to include the observed transitions.
 
         Raises:
-            ValueError: the model or the exploration is an object that a file cannot rebuild, or ``include`` is anything else.
+            ValueError: the model or exploration cannot be rebuilt from a file, or ``include`` names anything else.
             TypeError: ``path`` is neither a path nor an open binary file.
             OSError: the file cannot be written; an existing file is unchanged.
         """
@@ -552,7 +552,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
             **kwargs: constructor arguments that override the saved ones.
 
         Raises:
-            FileNotFoundError, TypeError, ValueError: there is no such file, ``path`` is not a path, or not a saved agent.
+            FileNotFoundError, TypeError, ValueError: there is no such file, or ``path`` is not a path or not a saved agent.
         """
         del custom_objects
         if print_system_info:
@@ -591,7 +591,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
         self.experience.dataset.save(path)
 
     def load_transitions(self, path: Target) -> None:
-        """Adds transitions from a file to this agent's experience; the next ``learn`` also fits to them.
+        """Adds transitions from a file to this agent's experience; the next ``learn`` includes them in the fit.
 
         Raises:
             FileNotFoundError: there is no such file.

@@ -23,10 +23,10 @@ MAX_SEED = 2**32 - 1
 
 
 def fitting_model(model: TransitionModel, space: FactoredSpace, n_actions: int) -> TransitionModel:
-    """The given model, if it fits this environment.
+    """The given model, if it matches this environment.
 
     Raises:
-        ValueError: the model has other factors or actions.
+        ValueError: the model has different factors or actions.
     """
     if tuple(model.cardinalities) != space.cardinalities or model.n_actions != n_actions:
         raise ValueError(
@@ -54,7 +54,7 @@ def planner_settings(own: Mapping[str, Any], policy_kwargs: Mapping[str, Any], s
 
 
 def _present(policy_kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings with present names and values; those of the version before work for one more version."""
+    """Settings with current names and values; deprecated ones from the previous version work for one more version."""
     given = dict(policy_kwargs)
     if "wave" in given:
         warnings.warn("policy_kwargs: 'wave' is now called 'batch_size'.", DeprecationWarning, stacklevel=4)
@@ -75,7 +75,7 @@ def check_seed(seed: Any) -> int | None:
 
 
 def check_timesteps(total: Any) -> int:
-    """``total_timesteps`` as an int; 1e5 is accepted, 2.5 is not. 0 means a fit to the recorded transitions, without a step."""
+    """``total_timesteps`` as an int; 1e5 is accepted, 2.5 is not. 0 means a fit to the recorded transitions only."""
     number = not isinstance(total, bool) and isinstance(total, int | float | np.number)
     if not number or not math.isfinite(total) or total < 0 or total != int(total):
         raise ValueError(f"total_timesteps must be a whole number of environment steps, 0 or more, got {total!r}.")
@@ -83,7 +83,7 @@ def check_timesteps(total: Any) -> int:
 
 
 def check_count(name: str, count: Any, none: str) -> int | None:
-    """An integer argument of at least 1, as an int; or None. ``none`` is the meaning of None, for the error message."""
+    """An integer argument of at least 1, as an int; or None. ``none`` describes the meaning of None in the error message."""
     if count is None:
         return None
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:

@@ -62,7 +62,8 @@ class AgentState:
 
     Attributes:
         data: JSON data, with at least the keys in REQUIRED.
-        arrays: by group and name: "policy" (weights), "planning" (start states), and "transitions" if they are included.
+        arrays: arrays by group and name; the groups are "policy" (weights), "planning" (start states) and, if included,
+            "transitions".
 
     Raises:
         ValueError: an entry is missing or of the wrong type; the message names it.
@@ -102,7 +103,7 @@ class AgentState:
 
     @property
     def transitions(self) -> TransitionBatch | None:
-        """The transitions, if they are included."""
+        """The transitions, or None if not included."""
         return TransitionBatch(**self.arrays["transitions"]) if "transitions" in self.arrays else None
 
 

@@ -42,10 +42,10 @@ Factors: TypeAlias = NDArray[np.integer[Any]]
 class TransitionBatch:
     """A batch of transitions, one per row.
 
-    States keep the integer type they are given in: a dataset stores bits as single bytes, an eighth of the size of int64.
+    States keep their given integer type: a dataset, for example, stores bits as uint8, an eighth of the size of int64.
 
     Attributes:
-        before: states, int [N, F] of any width.
+        before: states, [N, F], of any integer type.
         actions: int64 [N], numbers of the enumerated actions.
         after: next states, as ``before``.
         terminated: bool [N]; truncation is not recorded, since it is not part of the dynamics.
@@ -66,7 +66,7 @@ class TransitionBatch:
 
     @property
     def states(self) -> NDArray[np.int64]:
-        """States, int64 [N, F]; a new array at each call if they are stored in a narrower type."""
+        """States, int64 [N, F]; a new array at each access if they are stored as a narrower type."""
         return self.before.astype(np.int64, copy=False)
 
     @property
@@ -79,7 +79,7 @@ class TransitionBatch:
         return TransitionBatch(*(_selected(getattr(self, name), rows) for name in _KEPT))
 
     def narrowed(self, kind: np.dtype[Any]) -> TransitionBatch:
-        """The same rows with states of another integer type."""
+        """The same rows, with states converted to the given integer type."""
         return replace(self, before=self.before.astype(kind, copy=False), after=self.after.astype(kind, copy=False))
 
     def parts(self, size: int) -> Iterator[TransitionBatch]:
@@ -95,9 +95,9 @@ class TransitionDataset:
     Args:
         cardinalities: number of values of each state factor, length F.
         n_actions: number of enumerated actions A.
-        folder: folder for the rows, in growing files that are mapped into memory, so that the data may be larger than memory;
-            None to keep them in memory. Rows that are already in the folder come first. Rows of an ``append`` are added
-            only when all of its columns are on the disk: an interrupted call adds none.
+        folder: folder that stores the rows in growing, memory-mapped files, so that the data may be larger than memory; None to
+            keep the rows in memory. Rows already in the folder come first. An ``append`` takes effect only when all of its
+            columns are on disk, so an interrupted call adds no rows.
 
     Raises:
         ValueError: the folder holds transitions of another environment.
@@ -133,7 +133,7 @@ class TransitionDataset:
         """Adds rows.
 
         Raises:
-            ValueError: a wrong number of factors, or values or actions out of range.
+            ValueError: the number of factors is wrong, or values or actions are out of range.
         """
         self._check(batch)
         with self._lock:
@@ -176,10 +176,10 @@ class TransitionDataset:
                 )
 
     def take(self, other: TransitionDataset) -> None:
-        """Appends all rows of another dataset, as further episodes.
+        """Appends all rows of another dataset as new episodes.
 
         Raises:
-            ValueError: the other dataset has other factors or actions; this one is unchanged.
+            ValueError: the other dataset has different factors or actions; this dataset is unchanged.
         """
         if (other.cardinalities, other.n_actions) != (self.cardinalities, self.n_actions):
             raise ValueError(
@@ -204,7 +204,7 @@ class TransitionDataset:
             return self._chunks[0]
 
     def split(self, fraction: float, seed: int, min_episodes: int = 10) -> tuple[TransitionBatch, TransitionBatch]:
-        """Splits into training and validation rows by whole episodes, so that consecutive steps are never in both parts.
+        """Splits the rows into training and validation by whole episodes, so that consecutive steps of an episode stay together.
 
         With fewer than ``min_episodes`` episodes, the rows are instead cut into ``min_episodes`` runs of consecutive steps.
 
@@ -214,7 +214,7 @@ class TransitionDataset:
             min_episodes: see above.
 
         Returns:
-            (training, validation); with a fraction of 0, or fewer than 10 rows, both are all rows.
+            (training, validation); both contain all rows if ``fraction`` is 0 or there are fewer than 10 rows.
         """
         rows = self.rows()
         if fraction == 0.0 or len(rows) < 10:
@@ -236,14 +236,14 @@ class TransitionDataset:
         return result
 
     def save(self, path: files.Target) -> None:
-        """Writes the table as a compressed ``.npz`` of plain arrays, without pickled objects.
+        """Writes the dataset as a compressed ``.npz`` of plain arrays, without pickled objects.
 
         Args:
-            path: a path, to which ".npz" is appended unless it already ends with that, or an open binary file.
+            path: a path (".npz" is appended if missing), or an open binary file.
 
         Raises:
             TypeError, ValueError: ``path`` is neither.
-            OSError: the file cannot be written; an existing file at a path is unchanged.
+            OSError: the file cannot be written; if ``path`` is a path, an existing file there is unchanged.
         """
         rows = self.rows()
         with files.writing(path, ".npz", always=True) as file:
@@ -257,7 +257,7 @@ class TransitionDataset:
 
     @classmethod
     def load(cls, path: files.Target) -> TransitionDataset:
-        """Reads a file written by ``save``, or opens a dataset's folder, mapped into memory.
+        """Reads a file written by ``save``, or opens a dataset's folder with memory mapping.
 
         Args:
             path: a path (".npz" may be omitted), an open binary file, or a folder.
@@ -265,7 +265,7 @@ class TransitionDataset:
         Raises:
             FileNotFoundError: there is no such file.
             TypeError: ``path`` is none of these.
-            ValueError: the file or the folder does not contain such a table.
+            ValueError: the file or the folder does not contain a dataset.
         """
         if path and isinstance(path, str | os.PathLike) and Path(path).is_dir() and not Path(f"{os.fspath(path)}.npz").is_file():
             about = _read_description(Path(path))
@@ -277,7 +277,7 @@ class TransitionDataset:
 
 
 def _selected(values: NDArray[Any], rows: NDArray[Any] | slice) -> NDArray[Any]:
-    """The selected rows; a large selection of a mapped array is mapped to a temporary file."""
+    """The selected rows; a large selection from a memory-mapped array is itself mapped to a temporary file."""
     if not isinstance(values, np.memmap) or isinstance(rows, slice):
         return values[rows]
     numbers = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows
@@ -337,13 +337,13 @@ def _open_folder(folder: Path, cardinalities: tuple[int, ...], n_actions: int, k
 
 
 def _types(kind: np.dtype[Any]) -> dict[str, np.dtype[Any]]:
-    """Type of each column in the files, little-endian."""
+    """Little-endian data type of each column in the files."""
     kinds = {"states": kind, "next_states": kind, "terminated": np.dtype(np.bool_), "rewards": np.dtype(np.float64)}
     return {name: kinds.get(name, np.dtype(np.int64)).newbyteorder("<") for name in _COLUMNS}
 
 
 def _whole_rows(folder: Path, n_factors: int, kind: np.dtype[Any]) -> int:
-    """Number of rows that all column files contain completely."""
+    """Number of rows that are complete in every column file."""
     types = _types(kind)
     width = {name: n_factors if name in ("states", "next_states") else 1 for name in _COLUMNS}
     missing = [name for name in _COLUMNS if not (folder / f"{name}.bin").exists()]
@@ -353,7 +353,7 @@ def _whole_rows(folder: Path, n_factors: int, kind: np.dtype[Any]) -> int:
 
 
 def _mapped(folder: Path, n_factors: int, kind: np.dtype[Any]) -> TransitionBatch:
-    """The completely written rows, mapped; rows of an interrupted write are ignored."""
+    """The completely written rows, with memory-mapped states; rows of an interrupted write are ignored."""
     types, columns, written = _types(kind), [], _read_description(folder)["rows"]
     n = _whole_rows(folder, n_factors, kind)
     if written is not None and n < written:
@@ -385,7 +385,7 @@ def _write(folder: Path, batch: TransitionBatch, n_before: int) -> None:
 
 
 def _locked(folder: Path) -> AbstractContextManager[None]:
-    """Lock under which one process at a time changes a folder."""
+    """Lock that lets only one process at a time change a folder."""
     return files.locked(folder / f"{_COLUMNS[0]}.bin")
 
 
@@ -396,14 +396,14 @@ REUSE_CHANCE = 1e-3
 
 
 class Experience:
-    """All observed transitions, with the values of open factors (see FactoredSpace) as declared, so that none is lost.
+    """All observed transitions; open factors (see FactoredSpace) keep their declared numbers, so that no value is lost.
 
     Args:
         space: the observation space, without ``values``.
         n_actions: number of enumerated actions A.
 
     Attributes:
-        dataset: the transitions, with the values' declared numbers.
+        dataset: the transitions, with values as declared numbers.
     """
 
     def __init__(self, space: FactoredSpace, n_actions: int) -> None:
@@ -412,10 +412,10 @@ class Experience:
         self._coded: tuple[FactoredSpace, int, TransitionDataset] | None = None
 
     def coding(self) -> FactoredSpace:
-        """The space in which open factors have the values observed so far, in states or next states.
+        """The space with open factors restricted to the values observed so far in states or next states.
 
         Raises:
-            ValueError: a variable has too many values.
+            ValueError: a variable has too many observed values.
         """
         if not len(self.space.open):
             return self.space
@@ -423,7 +423,7 @@ class Experience:
         return self.space.with_values(np.concatenate([rows.before, rows.after]))
 
     def coded(self, space: FactoredSpace) -> TransitionDataset:
-        """The transitions in the factors of ``space``; the dataset itself if no factor is open."""
+        """The transitions, encoded in the factors of ``space``; the dataset itself if no factor is open."""
         if space.values is None or not len(space.open):
             return self.dataset
         n_rows = len(self.dataset)
@@ -435,7 +435,7 @@ class Experience:
 
 
 class ExperienceRecorder:
-    """Records the steps of ``n_envs`` environments that reset themselves, as those of SB3's VecEnv do.
+    """Records the steps of ``n_envs`` environments that reset automatically, as in SB3's VecEnv.
 
     Args:
         space: the observation space, without ``values``.
@@ -458,7 +458,7 @@ class ExperienceRecorder:
         self.states: States | None = None
 
     def reset(self, obs: Any) -> None:
-        """Starts a new episode in every environment, with the observations ``obs`` (batched)."""
+        """Starts a new episode in every environment from the batch of observations ``obs``."""
         with blaming_environment():
             self.states = self._space.encode(obs)
         self._begin(np.arange(len(self.states)))
@@ -477,18 +477,19 @@ class ExperienceRecorder:
         dones: NDArray[Any],
         infos: list[dict[str, Any]],
     ) -> TransitionBatch:
-        """Adds one step of every environment, and returns these transitions, [B].
+        """Records one step of every environment and returns these B transitions.
 
         Args:
             actions: int64 [B], numbers of the enumerated actions.
-            new_obs: observations as returned by the vector environment: after the end of an episode, the next one's first.
+            new_obs: observations from the vector environment's step; where an episode ended, the first observation of the next
+                one.
             rewards: float [B].
             dones: bool [B].
-            infos: as in SB3: the last observation of an episode is in ``terminal_observation``, a truncation in
-                ``TimeLimit.truncated``.
+            infos: as in SB3: ``terminal_observation`` holds the last observation of an episode, ``TimeLimit.truncated`` whether
+                it was truncated.
 
         Raises:
-            ValueError: a reward or an observation is invalid, or ``infos`` lacks a last observation.
+            ValueError: a reward or an observation is invalid, or ``infos`` lacks the last observation of an episode.
         """
         assert self.states is not None
         if not np.isfinite(rewards).all():
@@ -534,10 +535,10 @@ class ExperienceRecorder:
             self._steps = []
 
     def warn_of_reused_arrays(self) -> None:
-        """Warns, once, if the last observations of episodes appear to be overwritten by the following resets.
+        """Warns once if resets appear to overwrite the last observations of the preceding episodes.
 
-        This is assumed if each of them equals the next episode's first observation and the frequency of these start states
-        makes that unlikely by chance.
+        This is assumed if every episode's last observation equals the next one's first, and these start states are so rare that
+        this is unlikely by chance.
         """
         if not self._ends_at_starts or len(self._starts) < 2 or isinstance(self._space.space, spaces.Discrete):
             return  # numbers cannot be overwritten
@@ -573,7 +574,7 @@ def warn_of_forgetting(learned: bool, data: TransitionDataset) -> None:
 
 
 def distinct_rows(rows: States) -> States:
-    """The distinct rows [S, F] of [N, F], in order of first appearance."""
+    """The distinct rows [S, F] of ``rows`` [N, F], in order of first appearance."""
     if len(rows) == 0:
         return rows
     _, first = np.unique(rows, axis=0, return_index=True)

@@ -1,7 +1,8 @@
-"""Wrapping of environments as the VecEnv that the agent steps, in this process or in subprocesses.
+"""Wraps environments as the VecEnv that the agent steps, and handles VecEnvs whose environments run in subprocesses.
 
-Observations keep the environment's own layout. A worker process of SB3's SubprocVecEnv terminates at its first error, for example
-a missing attribute or one that cannot be pickled, so only attributes that are known to exist are requested from workers.
+Observations keep the environment's own layout. A worker process of SB3's SubprocVecEnv terminates at its first error, such as a
+request for an attribute that is missing or cannot be pickled. Workers are therefore asked only for attributes that are known to
+exist and to be picklable.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ def wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> Vec
     """Wraps environments as SB3 does, but without transposing the channels of image-like observations.
 
     Raises:
-        TypeError: SB3 does not support this kind of environment; or the observation space is nested more deeply than SB3's
-            vector environments support, see wrappers.Flat.
+        TypeError: SB3 does not support this kind of environment; or the observation space has a Dict or Tuple inside another,
+            which SB3's vector environments do not support (see wrappers.Flat).
         ValueError: the environment normalizes observations.
     """
     if not isinstance(env, VecEnv):
@@ -58,10 +59,10 @@ def wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> Vec
 
 
 class Guarded(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
-    """An environment whose results are checked and copied, so that it may reuse its arrays and dicts.
+    """Checks and copies an environment's results, so that the environment may reuse its own arrays and dicts.
 
-    SB3 keeps the last observation of an episode while the environment is reset; without a copy, a reset that overwrites the
-    environment's own array would replace that observation by the first one of the next episode.
+    SB3 keeps the last observation of an episode while it resets the environment. Without a copy, a reset that writes into the
+    same array would replace that observation with the first one of the next episode.
 
     Args:
         env: an environment with discrete spaces (see FactoredSpace).
@@ -117,7 +118,7 @@ class Guarded(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
 
 @contextmanager
 def blaming_environment() -> Iterator[None]:
-    """Attributes observations outside their space to the environment, in the error message.
+    """Raises an error that blames the environment for any observation outside the observation space.
 
     Raises:
         ValueError: an observation was outside the observation space.
@@ -164,10 +165,10 @@ LOOK_EVERY = 1.0
 
 @contextmanager
 def naming_ended_processes(env: VecEnv) -> Iterator[None]:
-    """Replaces the error of a broken pipe by one that explains it; errors of environments in this process pass unchanged.
+    """Replaces the error from a subprocess's broken pipe with one that explains it; other errors pass unchanged.
 
     Raises:
-        RuntimeError: a process of ``env`` has ended; the cause is the error of its pipe.
+        RuntimeError: a process of ``env`` has ended; the ``__cause__`` is the pipe error.
     """
     try:
         yield
@@ -178,7 +179,7 @@ def naming_ended_processes(env: VecEnv) -> Iterator[None]:
 
 
 def has_ended(env: VecEnv) -> bool:
-    """Whether the environments run in subprocesses of which one has ended, or has an unread answer from an interrupted step."""
+    """Whether any subprocess of ``env`` has ended, or has sent an answer that an interrupted step did not read."""
     inner = env.unwrapped
     try:
         return isinstance(inner, SubprocVecEnv) and any(remote.poll() for remote in inner.remotes)
@@ -187,7 +188,7 @@ def has_ended(env: VecEnv) -> bool:
 
 
 def step(env: VecEnv, actions: Any) -> tuple[Any, Any, Any, Any]:
-    """``env.step`` for environments in subprocesses that may end.
+    """``env.step``, but raises instead of blocking forever if a subprocess has ended.
 
     Raises:
         RuntimeError: a process has ended.
@@ -206,7 +207,7 @@ def step(env: VecEnv, actions: Any) -> tuple[Any, Any, Any, Any]:
 
 
 def own_reward(env: VecEnv) -> tuple[Any, str]:
-    """The ``reward_fn`` of the first environment or None, and the reason (the beginning of a sentence) if it is None."""
+    """(the first environment's ``reward_fn`` or None, the beginning of a sentence that says why it is None)."""
     missing = "The environment has no reward_fn"
     alone = not isinstance(env.unwrapped, SubprocVecEnv)
     try:
@@ -226,7 +227,7 @@ def own_reward(env: VecEnv) -> tuple[Any, str]:
 
 
 class _IfPicklable:
-    """The name of an attribute; the subprocess receives an empty name instead if the attribute's value cannot be pickled."""
+    """An attribute's name, which the subprocess unpickles as an empty string if the value cannot be pickled."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -248,7 +249,7 @@ def _if_picklable(name: str) -> str:
 
 
 class EnvironmentAlgorithm(BaseAlgorithm):
-    """SB3's base algorithm, adapted to environments whose steps or processes may fail, and to files without code."""
+    """SB3's base algorithm, adapted to environments whose steps or processes may fail and to checkpoints without code."""
 
     _recorder: Any = None
 
@@ -264,7 +265,7 @@ class EnvironmentAlgorithm(BaseAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        """SB3's setup; but if no steps are requested, a failed environment is not used."""
+        """SB3's setup, except that it does not touch a failed environment if ``total_timesteps`` is 0."""
         assert self.env is not None
         rest = tb_log_name, progress_bar
         ended = has_ended(self.env)

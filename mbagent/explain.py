@@ -36,8 +36,8 @@ class Step:
         action: the action, in the action space's own form.
         observation: the next observation, in the observation space's own form.
         probability: probability of this observation given the previous one and the action, as used by the planner. If the model
-            samples successors instead of listing them, this is the share of the samples (with 4 samples, one of a thousand
-            possible new mazes has 25%).
+            samples successors instead of listing them, this is the observation's share of the samples (with 4 samples, a new
+            maze that is sampled once has 25%, even if a thousand mazes are possible).
         reward: reward of this step, under the goal.
         terminated: whether the step ends the episode.
     """
@@ -64,7 +64,7 @@ class Future:
 
 @dataclass(frozen=True)
 class Explanation:
-    """The planner's results for one observation; A actions, in the order of their numbers.
+    """The planner's results for one observation; entry i of each array [A] belongs to action number i.
 
     Observations are in the observation space's own form, so that a game can draw them::
 
@@ -78,24 +78,24 @@ class Explanation:
     Attributes:
         observation: the explained observation.
         actions: the actions [A], in the action space's own form.
-        best: row of the action that ``predict`` takes.
-        values: float64 [A], estimated discounted return of each action, followed by the planner's best policy (flat Monte
-            Carlo: by random play).
+        best: index in ``actions`` of the action that ``predict`` takes.
+        values: float64 [A], estimated discounted return of taking each action and then following the planner's best policy (with
+            flat Monte Carlo, random play).
         errors: float64 [A], standard errors of the values: the standard deviation (ddof=1) over ``REPEATS`` decisions that
-            differ only in the planner's random numbers. They measure the randomness of simulations and sampled successors (0
-            if there is neither), but not the error of the model (see models.model_error).
-        chosen: float64 [A], share of these decisions that took the action. Since the actions of a decision share random
-            numbers, this is more informative about the choice than overlapping errors.
-        visits: float64 [A], simulations through each action; all 0 if there were none, as with the ValueIterationPolicy, or
-            if the whole MDP is solved.
-        mdp_states: number of states of the reachable MDP if it was solved completely; 0 if it is too large.
-        futures: for each action its most probable simulated futures, in decreasing order. After the action they follow the
-            planner's best policy (with flat Monte Carlo, which has none, they are one step long).
-        rare: for each action the outcomes less probable than ``RARE_VALUE`` that contribute to its value, in decreasing order
-            of their effect (with flat Monte Carlo, which does not value them, in increasing order of probability).
-            Probabilities are posterior means if the model is learned from counts.
-        effects: for each of these, its contribution to the action's value, compared with the average of the other outcomes; 0
-            with flat Monte Carlo.
+            differ only in the planner's random numbers. These errors measure the randomness of simulations and of sampled
+            successors (0 if there is neither), but not the error of the model (see models.model_error).
+        chosen: float64 [A], share of these decisions that took the action. Since all actions of one decision are evaluated with
+            the same random numbers, this says more about the certainty of the choice than overlapping error bars do.
+        visits: float64 [A], number of simulations through each action; all 0 if nothing was simulated, as with
+            ValueIterationPolicy or if the whole MDP is solved.
+        mdp_states: number of states of the reachable MDP if it was solved completely, else 0.
+        futures: for each action, its most probable simulated futures, in decreasing order of probability. After the action, each
+            future follows the planner's best policy. With flat Monte Carlo, which has no such policy, futures are one step long.
+        rare: for each action, the outcomes in the plan that are less probable than ``RARE_VALUE``, in decreasing order of their
+            absolute effect on the action's value (with flat Monte Carlo, which computes no effects, in increasing order of
+            probability). Probabilities are posterior means if the model is learned from counts.
+        effects: for each outcome in ``rare``, the action's value minus the mean value of the action's other outcomes; 0 with
+            flat Monte Carlo.
     """
 
     observation: Any
@@ -120,7 +120,7 @@ class Explanation:
         """The best actions and their futures, as text.
 
         Args:
-            n_actions: largest number of actions shown; the chosen action is first, followed by the others in order of value.
+            n_actions: maximum number of actions shown: first the chosen action, then the others in decreasing order of value.
         """
         rest = [int(a) for a in np.argsort(-self.values, kind="stable") if a != self.best]
         rows = [self.best, *rest][: max(n_actions, 1)]
@@ -178,7 +178,7 @@ def _explanation(policy: PlannerPolicy, observation: Any, n_futures: int, n_step
 
 
 def _single_state(policy: PlannerPolicy, observation: Any) -> States:
-    """The observation as factors [1, F]; ValueError if the agent cannot plan for it."""
+    """Encodes the observation as factors [1, F]; raises ValueError if the agent cannot plan for it."""
     if not policy.fitted:
         raise ValueError("This agent has learned nothing yet, so there is nothing to explain; call learn() first.")
     if policy.goal is None:
@@ -190,7 +190,7 @@ def _single_state(policy: PlannerPolicy, observation: Any) -> States:
 
 
 def _planner(policy: PlannerPolicy, settings: PlannerSettings, like: Planner) -> Planner:
-    """A new planner with the lookahead configuration of ``like``, so that the policy's own planner is not changed."""
+    """A new planner with the lookahead configuration of ``like``; leaves the policy's own planner unchanged."""
     planner = policy.planner_class(settings)
     planner.set_model(policy.transition_model, policy.start_states)
     assert policy.goal is not None  # checked in ``_single_state``
@@ -207,7 +207,7 @@ def _trace(planner: Planner, state: States) -> PlanTrace:
 
 
 def _other_values(policy: PlannerPolicy, settings: PlannerSettings, state: States, like: Planner) -> list[tuple[Floats, int]]:
-    """(values [1, A], action taken) of decisions with other random numbers."""
+    """(values [1, A], action taken) of each decision with other random numbers."""
     found = []
     for repeat in range(1, REPEATS):
         seed = int(derive(settings.seed, _OTHER_SEEDS, repeat)[0] >> np.uint64(1))
@@ -217,7 +217,7 @@ def _other_values(policy: PlannerPolicy, settings: PlannerSettings, state: State
 
 
 def _steps(policy: PlannerPolicy, found: PlanTrace, edges: Sequence[int]) -> tuple[Step, ...]:
-    """The steps that edges of the state graph represent."""
+    """Converts edges of the state graph into steps."""
     if len(edges) == 0:
         return ()
     graph, actions = found.graph, policy.actions.decode(np.arange(policy.actions.n))
@@ -243,7 +243,7 @@ def _futures(policy: PlannerPolicy, found: PlanTrace, n_futures: int, n_steps: i
 
 
 def _rare(policy: PlannerPolicy, found: PlanTrace, most: int) -> dict[str, Any]:
-    """``rare`` and ``effects`` of Explanation, at most ``most`` for each action."""
+    """The fields ``rare`` and ``effects`` of Explanation, with at most ``most`` outcomes for each action."""
     graph, steps, effects = found.graph, [], []
     for first, count in zip(graph.first[found.root], graph.counts[found.root], strict=True):
         edges = np.arange(first, first + count)
@@ -261,7 +261,7 @@ def _rare(policy: PlannerPolicy, found: PlanTrace, most: int) -> dict[str, Any]:
 
 
 def _row(batch: Any, index: int) -> Any:
-    """One observation of a batch in the form of ``batch_space``."""
+    """The observation at ``index`` in a batch that has the form of ``batch_space``."""
     if isinstance(batch, Mapping):
         return {key: _row(part, index) for key, part in batch.items()}
     if isinstance(batch, tuple):
@@ -270,7 +270,7 @@ def _row(batch: Any, index: int) -> Any:
 
 
 def _as_text(future: Future) -> str:
-    """A future as a line of text: actions, short observations, non-zero rewards, termination."""
+    """A future as one line of text: actions, observations (if short), non-zero rewards, and termination."""
     parts = []
     for step in future.steps:
         seen = _text(step.observation)

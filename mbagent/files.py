@@ -144,7 +144,7 @@ def replaced(path: Path) -> Iterator[BinaryIO]:
 
 
 def _prepare(path: Path) -> os.stat_result | None:
-    """Status of the file to be replaced; None if there is none. Creates the folder."""
+    """Status of the file to be replaced; None if it is missing. Creates the folder."""
     try:
         with _explain_permissions(path):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -232,7 +232,7 @@ def _copy_permissions(path: Path, before: os.stat_result) -> None:
 
 
 def _sync(folder: Path) -> None:
-    """Flushes a folder's entries to the disk, if supported; the file is complete under either name in any case."""
+    """Flushes a folder's entries to disk, if supported; if not, the file is still complete under either name."""
     with suppress(OSError):
         number = os.open(folder, os.O_RDONLY)
         try:

@@ -26,8 +26,8 @@ class LearnedEnv(gym.Env[Any, Any]):
     """The current state of an agent's model as an environment, with a reward of your choice.
 
     Next states and terminations are sampled from the model. Start states are sampled with the frequencies of the agent's
-    episodes. The spaces are those of the agent's environment. No step of the real environment is taken, so rewards can be tested
-    and algorithms compared in it; the results depend on the accuracy of the model.
+    episodes. The spaces are those of the agent's environment. Rewards can be tested and algorithms compared without steps in the
+    real environment; the results depend on the model's accuracy.
 
     Args:
         agent: an agent that has learned. If it learns further, create a new LearnedEnv.

@@ -32,8 +32,8 @@ class Lock:
 class PlanningLock(Lock):
     """The lock of all data that a plan depends on: while one thread plans, no other thread plans or changes these data.
 
-    The planning thread itself, which a re-entrant lock would admit, is excluded as well: a reward function called by the planner
-    could otherwise replace the search that calls it.
+    Unlike a re-entrant lock, it also excludes the planning thread itself: otherwise, a reward function called by the planner
+    could replace the search that called it.
 
     Raises (when entered):
         RuntimeError: this thread is planning.

@@ -1,4 +1,4 @@
-"""Module paths of the version before, which work for one more version with a DeprecationWarning."""
+"""Module paths of the previous version, valid for one more version with a DeprecationWarning."""
 
 from __future__ import annotations
 

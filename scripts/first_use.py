@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.console import Console
 
 ENVIRONMENTS = ("mbagent/GeyserRunner-v0", "FrozenLake-v1", "mbagent/FlierCatcher-v0")
 
@@ -61,9 +62,10 @@ def main(environments: Annotated[tuple[str, ...], tyro.conf.Positional] = ENVIRO
             statistics.median(seconds(IMPORT.format(name=name), Path(folder)) for _ in range(3))
             for name in ("mbagent", "stable_baselines3")
         )
-    print(f"import mbagent: {ours:.1f} s, import stable_baselines3: {theirs:.1f} s", flush=True)
+    console = Console()
+    console.print(f"import mbagent: {ours:.1f} s, import stable_baselines3: {theirs:.1f} s", highlight=False)
     for name in environments:
-        print(f"{name}: {statistics.median(measure(name) for _ in range(repetitions)):.1f} s", flush=True)
+        console.print(f"{name}: {statistics.median(measure(name) for _ in range(repetitions)):.1f} s", highlight=False)
 
 
 if __name__ == "__main__":

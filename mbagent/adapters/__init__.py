@@ -1,1 +1,1 @@
-"""Environments of other packages in a form that the agent supports. Each module requires the extra that it names."""
+"""Environments from other packages, adapted for the agent. Each module's docstring names the pip extra that it requires."""

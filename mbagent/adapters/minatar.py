@@ -19,7 +19,7 @@ from mbagent.wrappers import History
 
 
 class MinAtarEnv(gym.Env[NDArray[np.int8], np.int64], gym.utils.EzPickle):
-    """A MinAtar game: bits [channels, 10, 10], and the actions that have an effect in this game.
+    """A MinAtar game with binary observations [channels, 10, 10] and only the actions that have an effect in this game.
 
     Args:
         game: "asterix", "breakout", "freeway", "seaquest" or "space_invaders".
@@ -66,15 +66,15 @@ class MinAtarEnv(gym.Env[NDArray[np.int8], np.int64], gym.utils.EzPickle):
 
 
 def make_minatar(game: str, *, k: int = 1, max_episode_steps: int = 1000, **kwargs: Any) -> gym.Env[Any, Any]:
-    """A MinAtar game whose observation includes the last ``k`` frames and actions; see History.
+    """A MinAtar game whose observation includes the previous ``k`` frames and actions; see History.
 
-    Sticky actions and objects that move only in some frames depend on them.
+    This history is needed to predict sticky actions and objects that move only in some frames.
 
     Args:
         game: see MinAtarEnv.
         k: number of previous frames; 0 for the current frame only.
-        max_episode_steps: steps after which an episode is truncated; a good player might never lose.
-        **kwargs: for MinAtarEnv.
+        max_episode_steps: steps after which an episode is truncated, since a good player might never lose.
+        **kwargs: passed to MinAtarEnv.
     """
     env: gym.Env[Any, Any] = TimeLimit(MinAtarEnv(game, **kwargs), max_episode_steps)
     return History(env, k) if k else env

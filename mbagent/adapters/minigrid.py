@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 class WholeGrid(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArgs):
     """A MiniGrid world whose observation is the whole grid and, optionally, the carried object.
 
-    Planes [width, height, 3]: kind of object, colour, and state (of a door, or the direction of the agent), as in
-    ``minigrid.wrappers.FullyObsWrapper``, without the mission's text. A carried object is not on the grid, so
-    with ``carried`` it is shown in the lower right corner, which is always a wall.
+    The channels of [width, height, 3] are object type, colour, and state (of a door) or direction (of the agent), as in
+    ``minigrid.wrappers.FullyObsWrapper``, but without the mission text. A carried object is not on the grid; with ``carried``,
+    it is shown in the lower right corner, which is otherwise always a wall.
 
     Args:
         env: a MiniGrid environment.
@@ -55,7 +55,7 @@ def make_minigrid(env_id: str, *, carried: bool = False, **kwargs: Any) -> gym.E
     Args:
         env_id: name of the environment ("MiniGrid-Empty-5x5-v0").
         carried: see WholeGrid.
-        **kwargs: for ``gym.make``.
+        **kwargs: passed to ``gym.make``.
 
     Raises:
         DependencyNotInstalled: minigrid is missing.
@@ -67,7 +67,7 @@ def make_minigrid(env_id: str, *, carried: bool = False, **kwargs: Any) -> gym.E
 
 
 def minigrid_factory(env_id: str, *, carried: bool = False, **kwargs: Any) -> Callable[[], gym.Env[Any, Any]]:
-    """A picklable function without arguments that creates environments, for SubprocVecEnv. See ``make_minigrid``."""
+    """A picklable zero-argument function that creates environments, for SubprocVecEnv. See ``make_minigrid``."""
     return partial(make_minigrid, env_id, carried=carried, **kwargs)
 
 

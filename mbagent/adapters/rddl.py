@@ -1,4 +1,4 @@
-"""RDDL domains as environments with one Discrete action and discrete observations (``pip install "mbagent[rddl]"``).
+"""RDDL domains as environments with a Discrete action space and discrete observations (``pip install "mbagent[rddl]"``).
 
 RDDL (Sanner, Relational Dynamic Influence Diagram Language, 2010) is the language of the probabilistic planning
 competitions; ``rddlrepository`` holds their domains, and pyRDDLGym simulates them.
@@ -28,19 +28,19 @@ Assignment = dict[str, Any]
 
 
 class RddlEnv(gym.Env[NDArray[np.integer[Any]], np.int64], gym.utils.EzPickle):
-    """An RDDL domain and instance, with one Discrete action and the fluents as a vector of variables.
+    """An instance of an RDDL domain, with a Discrete action space and a vector of fluents as the observation.
 
-    Observations are ``MultiBinary``, one bit for each state fluent (observation fluent, in a POMDP), or ``MultiDiscrete`` if
-    some have more than two values. Joint actions are numbered: 0 is the no-op, followed by those in which one action fluent
-    differs from its default, then two and so on, up to the instance's max-nondef-actions. Episodes are truncated at the
-    instance's horizon. Copies can be pickled; each has its own random numbers.
+    Observations have one variable for each state fluent (in a POMDP, each observation fluent): ``MultiBinary`` if all have two
+    values, else ``MultiDiscrete``. Joint actions are numbered by how many action fluents differ from their defaults: 0 is the
+    no-op, then come all actions with one such fluent, then two, and so on, up to the instance's max-nondef-actions. Episodes are
+    truncated at the instance's horizon. Environments can be pickled; each copy has its own random numbers.
 
     Args:
         domain: a name in rddlrepository ("SysAdmin_MDP_ippc2011"), or the path of a domain.rddl.
-        instance: one of its instances (1), or the path of an instance.rddl.
+        instance: name of one of the domain's instances (1), or the path of an instance.rddl.
 
     Attributes:
-        assignments: the fluent values of each action.
+        assignments: the non-default fluent values of each action.
         fluents: name of each variable of an observation.
 
     Raises:
@@ -91,7 +91,7 @@ class RddlEnv(gym.Env[NDArray[np.integer[Any]], np.int64], gym.utils.EzPickle):
         return observed
 
     def _number(self, value: Any) -> int:
-        """A fluent's value as an integer: an object's number within its type; 0 if there is no value."""
+        """A fluent's value as an integer: for an object, its index within its type; 0 if there is no value."""
         if value is None:
             return 0
         return int(self.rddl.model.object_to_index[value]) if isinstance(value, str) else int(value)
@@ -103,7 +103,7 @@ def rddl_factory(domain: str, instance: str | int = 1) -> Callable[[], RddlEnv]:
 
 
 def load_rddl(domain: str, instance: str | int, **kwargs: Any) -> Any:
-    """A pyRDDLGym environment; see RddlEnv for the arguments and errors, ``pyRDDLGym.RDDLEnv`` for further arguments."""
+    """A pyRDDLGym environment; see RddlEnv for the arguments and errors, and ``pyRDDLGym.RDDLEnv`` for ``**kwargs``."""
     missing = [name for name in ("pyRDDLGym", "rddlrepository") if importlib.util.find_spec(name) is None]
     if missing:
         raise DependencyNotInstalled(f'RDDL domains need {" and ".join(missing)}: pip install "mbagent[rddl]".')
@@ -124,14 +124,14 @@ def load_rddl(domain: str, instance: str | int, **kwargs: Any) -> Any:
 
 
 def _values_of(space: spaces.Space[Any], name: str) -> tuple[int, int]:
-    """Lowest value and number of values."""
+    """A fluent's lowest value and number of values."""
     if not isinstance(space, spaces.Discrete):
         raise TypeError(f"The fluent {name!r} is continuous ({space}), and only discrete ones can be modelled.")
     return int(space.start), int(space.n)
 
 
 def _joint_actions(env: Any) -> tuple[Assignment, ...]:
-    """All joint actions in which no more than the allowed number of fluents differ from their defaults, fewest first."""
+    """All joint actions with at most the allowed number of non-default fluents, in increasing order of that number."""
     defaults: dict[str, Any] = env._noop_actions  # pyRDDLGym has no public name for them
     choices: dict[str, list[Any]] = {}
     for name, part in env.action_space.spaces.items():
@@ -150,7 +150,7 @@ def _joint_actions(env: Any) -> tuple[Assignment, ...]:
 
 
 def _refuse_too_many(sizes: list[int], most: int) -> None:
-    """Raises ValueError if there are too many joint actions, which are counted without listing them."""
+    """Raises ValueError if there are too many joint actions; counts them without enumerating them."""
     counts = [1] + [0] * most  # by the number of non-default fluents
     for size in sizes:
         counts = [n + size * (counts[k - 1] if k else 0) for k, n in enumerate(counts)]

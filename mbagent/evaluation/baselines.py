@@ -49,11 +49,11 @@ Evaluate = Callable[[Policy, bool], float]
 
 
 def as_policy(algorithm: Any, *, deterministic: bool = True) -> Policy:
-    """Policy of an object with SB3's ``predict``.
+    """Turns an object with SB3's ``predict`` into a policy.
 
     Args:
         algorithm: an SB3 algorithm, or the agent of this package.
-        deterministic: take the most likely action; else sample as in training.
+        deterministic: whether to take the most likely action; if not, actions are sampled as in training.
     """
 
     def policy(obs: Any) -> NDArray[np.int64]:
@@ -64,10 +64,10 @@ def as_policy(algorithm: Any, *, deterministic: bool = True) -> Policy:
 
 
 def best_mode(algorithm: Any, evaluate: Evaluate) -> tuple[bool, float]:
-    """Whether an algorithm scores better with its most likely actions or with sampled ones, and that score.
+    """(whether an algorithm's most likely actions score at least as well as sampled ones, the better score).
 
-    A policy whose most likely action runs against a wall forever does better with sampled actions; each
-    baseline is scored in its better mode.
+    Each baseline is scored in its better mode: a policy whose most likely action runs into a wall forever, for example, does
+    better with sampled actions.
     """
     likely = evaluate(as_policy(algorithm, deterministic=True), True)
     sampled = evaluate(as_policy(algorithm, deterministic=False), False)
@@ -75,7 +75,7 @@ def best_mode(algorithm: Any, evaluate: Evaluate) -> tuple[bool, float]:
 
 
 class _Checkpoints(BaseCallback):
-    """Evaluates the policy at evenly spaced numbers of environment steps."""
+    """Evaluates the policy before training and then at equal intervals of environment steps."""
 
     def __init__(self, total: int, points: int, evaluate: Evaluate, report: Callable[[float], None] | None) -> None:
         super().__init__()
@@ -113,15 +113,15 @@ def train_baseline(
     Args:
         name: the algorithm.
         make_env: creates one environment.
-        steps: environment steps over all copies together.
+        steps: total number of environment steps over all copies.
         seed: seed of networks, exploration and environments.
-        evaluate: returns the mean return of (policy, whether it is deterministic), for the learning curve.
-        points: evaluations on the learning curve, in addition to the one before training.
-        reward_scale: factor of the rewards in training; None for that of BASELINE_SETTINGS.
-        report: called with the share of steps done, 0 ... 1.
+        evaluate: (policy, whether it is deterministic) -> mean return; used for the learning curve.
+        points: number of evaluations on the learning curve, not counting the one before training.
+        reward_scale: factor by which rewards are multiplied in training; None for the one in BASELINE_SETTINGS.
+        report: called with the fraction of steps done, from 0 to 1.
 
     Returns:
-        (the trained algorithm, learning curve as (environment steps, mean return)).
+        (trained algorithm, learning curve as a list of (environment steps, mean return)).
     """
     settings = dict(BASELINE_SETTINGS[name])
     usual = settings.pop("reward_scale", 1.0)

@@ -1,6 +1,6 @@
-"""Plays whole episodes of any policy in one batch and scores them, for several goals at once on request.
+"""Plays whole episodes with any policy in one batch and scores them, optionally under several goals at once.
 
-Evaluation episodes never coincide with training episodes: their random keys are derived from a separate salt.
+Evaluation episodes never coincide with training episodes, because evaluation derives its random keys with a separate salt.
 With the same seed, every policy gets the same start states and random numbers, so that differences in returns
 are due to the policies.
 """
@@ -34,9 +34,9 @@ class Evaluation:
     """Episodes played by one policy.
 
     Attributes:
-        returns: goal name to undiscounted return of each episode, float64 [episodes].
+        returns: for each goal name, the undiscounted returns of the episodes, float64 [episodes].
         seconds: wall time spent in the policy.
-        decisions: number of decisions of the policy.
+        decisions: number of actions requested from the policy.
     """
 
     returns: Mapping[str, NDArray[np.float64]]
@@ -51,7 +51,7 @@ class Evaluation:
 
 @dataclass
 class _Stopwatch:
-    """Times a policy, and calls it only once for equal observations if it is ``repeatable``."""
+    """Times a policy; if it is ``repeatable``, calls it only once for each distinct observation."""
 
     policy: Policy
     repeatable: bool
@@ -90,15 +90,15 @@ def evaluate_game(
     """Plays ``episodes`` episodes of a game in parallel.
 
     Args:
-        game: the game; its ``max_episode_steps`` ends an episode.
+        game: the game; episodes are cut off after ``game.max_episode_steps`` steps.
         policy: chooses the actions.
         episodes: number of episodes.
         seed: seed of start states and random numbers.
-        goals: reward functions by name with which the episodes are scored; None for the game's own, named
+        goals: reward functions by name; episodes are scored by each of them. None for only the game's own reward, under the name
             "default".
-        repeatable: whether equal observations always get equal actions, so that the policy is called only
-            once for them.
-        report: called with the share done, 0 ... 1, after every step.
+        repeatable: whether the policy always chooses equal actions for equal observations; if so, it is called only once for
+            each distinct observation.
+        report: called after every step with the fraction done, from 0 to 1.
     """
     goals = {"default": game.reward} if goals is None else goals
     keys = derive(derive(seed, _REPORTING), np.arange(episodes))
@@ -133,7 +133,7 @@ def evaluate_env(
     """Plays one episode in each of ``episodes`` copies of an environment, with one batch of decisions per step.
 
     Args:
-        make_env: creates a copy, whose episodes must end by themselves.
+        make_env: creates one copy; its episodes must end by termination or truncation.
         policy: chooses the actions; observations are batched as in ``gymnasium.vector.utils.batch_space``.
         episodes: number of episodes.
         seed: seed of the environments.
@@ -177,8 +177,8 @@ def milliseconds_per_decision(policy: Policy, observations: NDArray[Any], *, war
 
     Args:
         policy: the policy to time.
-        observations: observations [N, ...]; each is a batch of its own.
-        warm_up: decisions before timing starts (compilation, caches).
+        observations: observations [N, ...], each passed to the policy as a batch of one.
+        warm_up: number of untimed decisions made first (compilation, caches).
     """
     for row in range(min(warm_up, len(observations))):
         policy(observations[row : row + 1])

@@ -37,14 +37,14 @@ class Line:
     """One line of a panel.
 
     Attributes:
-        x: numbers [N]; empty for a horizontal line across the whole panel.
-        y: numbers [N]; a single one for a horizontal line.
+        x: x coordinates [N]; empty for a horizontal line across the whole panel.
+        y: y coordinates [N]; a single one for a horizontal line.
         colour: colour of the line.
-        label: its name in the legend; lines with equal labels share an entry, and "" has none.
+        label: name of the line in the legend; lines with equal labels share one entry, and lines labelled "" have none.
         error: half-lengths of error bars [N], or None.
         band: lower and upper ends [N] of a shaded band, or None.
         marker: marker of the points.
-        style: solid, or "--", ":".
+        style: "-" (solid), "--" or ":".
     """
 
     x: Sequence[float]
@@ -65,9 +65,9 @@ class Panel:
         title: title above the panel.
         lines: the lines.
         x_label, y_label: labels of the axes.
-        x_scale, y_scale: "linear", "log", or for x "log2".
-        y_limits: lower and upper end; None to fit the lines.
-        x_ticks: positions and labels; None for matplotlib's own.
+        x_scale, y_scale: "linear" or "log"; x_scale may also be "log2".
+        y_limits: lower and upper limit; each is fitted to the lines if None.
+        x_ticks: tick labels by position; None for matplotlib's own ticks.
     """
 
     title: str

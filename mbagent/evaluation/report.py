@@ -1,4 +1,4 @@
-"""Report pages: tables and figures on one self-contained HTML page, and the formatting of numbers."""
+"""Report pages (tables and figures in one self-contained HTML file) and the formatting of numbers."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Table:
 
     Attributes:
         columns: column titles.
-        rows: cells, each row as long as ``columns``; the first cell is the row's name.
+        rows: cells of each row, one for each column; the first cell is the row's name.
     """
 
     columns: Sequence[str]
@@ -37,7 +37,7 @@ class Table:
 
     @classmethod
     def of(cls, rows: Sequence[Mapping[str, Any]], shown: Callable[[Any], str]) -> Table:
-        """Table of rows with equal keys, each value formatted by ``shown``."""
+        """A table from rows with the same keys (the columns); ``shown`` formats each value."""
         return cls(list(rows[0]), [[shown(value) for value in row.values()] for row in rows])
 
     def markdown(self, names: int = 1) -> str:
@@ -86,7 +86,7 @@ class Page:
         intro: first paragraph.
         sections: the results.
         command: the command line that reproduces the page.
-        methods: paragraphs about the methods, by their headings.
+        methods: paragraphs about the methods, keyed by their headings.
     """
 
     name: str
@@ -107,12 +107,12 @@ def inline(text: str) -> Markup:
 
 
 def render(template: Path, filters: dict[str, Callable[..., Any]] | None = None, **values: Any) -> str:
-    """Renders a page as one self-contained HTML text.
+    """Renders a page from a template as self-contained HTML.
 
     Args:
-        template: file of the template; it may extend ``base.html.jinja`` of this package.
-        filters: additional filters.
-        **values: its variables; ``versions``, ``python`` and ``date`` are always defined.
+        template: template file, which may extend this package's ``base.html.jinja``.
+        filters: additional Jinja filters.
+        **values: variables for the template; ``versions``, ``python`` and ``date`` are always defined.
     """
     environment = Environment(
         loader=FileSystemLoader([template.parent, _TEMPLATES]),
@@ -131,7 +131,7 @@ def render(template: Path, filters: dict[str, Callable[..., Any]] | None = None,
 
 
 def format_number(value: float, digits: int = 2) -> str:
-    """Formats a number for a table, with a true minus sign; an en dash stands for a missing value."""
+    """Formats a number for a table, with a typographic minus sign; NaN (missing) becomes an en dash."""
     if math.isnan(value):
         return "–"
     text = f"{value:,.{digits}f}"

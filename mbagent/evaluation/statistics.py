@@ -1,8 +1,8 @@
-"""Normalised returns and interquartile means with stratified bootstrap intervals.
+"""Normalised returns, and interquartile means with hierarchical bootstrap intervals.
 
 The interquartile mean over runs and its bootstrap are those of Agarwal et al. 2021, "Deep Reinforcement
-Learning at the Edge of the Statistical Precipice". A run is one seed (one training); its score is the mean
-over its episodes.
+Learning at the Edge of the Statistical Precipice". A run is one training with one seed; the run's score is the mean over its
+evaluation episodes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Interval:
 
 
 def mean_interval(values: Iterable[float]) -> Interval:
-    """Mean with its 95% t interval, without NaN values. For a single value, the ends of the interval are NaN."""
+    """Mean with its 95% t interval, ignoring NaN values. For a single value, both ends of the interval are NaN."""
     given = np.asarray(list(values), dtype=np.float64)
     known = given[~np.isnan(given)]
     if len(known) == 0:
@@ -45,18 +45,18 @@ def mean_interval(values: Iterable[float]) -> Interval:
 
 
 def normalised(returns: ArrayLike, random: float, reference: float) -> Floats:
-    """Returns on a scale on which random play is 0 and the reference is 1.
+    """Rescales returns linearly so that random play is 0 and the reference is 1.
 
     Args:
         returns: returns of any shape.
         random: mean return of the random policy.
-        reference: mean return of the reference: the exact optimum if it can be computed.
+        reference: mean return that is scaled to 1; use the exact optimum if it can be computed.
 
     Returns:
         Float array of the same shape.
 
     Raises:
-        ValueError: the reference is not better than random play, so there is no scale.
+        ValueError: ``reference`` is not greater than ``random``, so no scale is defined.
     """
     if not reference > random:
         raise ValueError(
@@ -67,13 +67,13 @@ def normalised(returns: ArrayLike, random: float, reference: float) -> Floats:
 
 
 def interquartile_mean(values: ArrayLike) -> Floats:
-    """Mean of the middle half along the last axis: a quarter, rounded down, is cut off at each end.
+    """Mean of the middle half along the last axis: at each end, a quarter of the values (rounded down) is dropped.
 
     Args:
         values: floats [..., N].
 
     Returns:
-        Float array [...]; with fewer than four values it is the plain mean.
+        Float array [...]; for N < 4, the plain means.
 
     Raises:
         ValueError: no values.
@@ -87,11 +87,11 @@ def interquartile_mean(values: ArrayLike) -> Floats:
 
 
 def interquartile_interval(scores: ArrayLike, *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0) -> Interval:
-    """Interquartile mean over runs, with a percentile bootstrap interval stratified by run.
+    """Interquartile mean over runs, with a percentile interval from a hierarchical bootstrap.
 
     Each resample draws runs with replacement and, within each drawn run, episodes with replacement, so that
-    the interval covers both the variation between trainings and the noise of the evaluation. With a single run,
-    it covers only the latter.
+    the interval covers both the variation between trainings and the noise of the evaluation. With a single run, it covers only
+    the evaluation noise.
 
     Args:
         scores: floats [runs, episodes].
@@ -100,7 +100,7 @@ def interquartile_interval(scores: ArrayLike, *, confidence: float = 0.95, resam
         seed: seed of the resampling; equal seeds give equal intervals.
 
     Raises:
-        ValueError: not a matrix with at least one entry, or a confidence outside (0, 1).
+        ValueError: ``scores`` is not a matrix with at least one entry, or ``confidence`` is outside (0, 1).
     """
     matrix = np.asarray(scores, dtype=np.float64)
     if matrix.ndim != 2 or matrix.size == 0:
@@ -119,21 +119,21 @@ def interquartile_interval(scores: ArrayLike, *, confidence: float = 0.95, resam
 def ratio_interval(
     scores: ArrayLike, others: ArrayLike, zero: float, *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0
 ) -> Interval:
-    """(mean of scores - zero) / (mean of others - zero), with a percentile bootstrap interval stratified by run.
+    """(mean of scores - zero) / (mean of others - zero), with a percentile interval from a hierarchical bootstrap.
 
-    Corresponding entries were played with the same random numbers, so both are resampled together. Both sides are plain
-    means: trimming could remove the bad runs of one agent only and favour it.
+    Corresponding entries of the two arrays were played with the same random numbers, so both arrays are resampled with the same
+    indices. Numerator and denominator use plain means: trimming could favour one agent by removing only its bad runs.
 
     Args:
         scores: floats [runs, episodes].
-        others: floats [runs, episodes] of the reference.
+        others: scores of the reference, floats [runs, episodes].
         zero: zero point of the scale, such as the mean of random play.
         confidence: probability mass of the interval, between 0 and 1.
         resamples: number of bootstrap resamples.
         seed: seed of the resampling.
 
     Raises:
-        ValueError: the two differ in shape, or ``others`` are not above ``zero``.
+        ValueError: ``scores`` and ``others`` differ in shape, or the mean of ``others`` is not above ``zero``.
     """
     above, below = (np.asarray(x, dtype=np.float64) - zero for x in (scores, others))
     if above.ndim != 2 or above.shape != below.shape or above.size == 0:

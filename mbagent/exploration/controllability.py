@@ -1,4 +1,4 @@
-"""Controllable factors: a quick test by Bayesian evidence, without a model, which factors depend on actions."""
+"""Controllable factors: a quick Bayesian test, without a transition model, of which factors depend on actions."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ class Controllable:
 
     Attributes:
         directly: whether the next value depends on the action, given the current value, bool [F].
-        classes: for each factor that changed, the class of each of its values, named by its lowest value. Values of a class
-            change into each other often, but independently of the action.
+        classes: for each factor that changed, a mapping of each value to the lowest value in its class. Values in the same class
+            often change into each other, independently of the action.
     """
 
     directly: Bools
@@ -50,10 +50,10 @@ class Controllable:
 
 
 class StateAbstraction:
-    """State abstraction: some factors unchanged, of some others only the class of each value.
+    """A state abstraction that keeps some factors, maps values of others to their classes, and drops the rest.
 
     Args:
-        found: dependences on actions.
+        found: result of ``find_controllable``.
         whole: factors that are kept unchanged in any case, bool [F].
     """
 
@@ -74,7 +74,7 @@ class StateAbstraction:
                 self.classes[row, value] = lowest
 
     def __call__(self, states: Values) -> States:
-        """Abstract states int64 [B, K] of states [B, F]."""
+        """Maps states [B, F] to abstract states int64 [B, K]."""
         kept = states.take(self.factors, axis=1).astype(np.int64, copy=False)
         if not len(self.some):
             return kept
@@ -89,12 +89,12 @@ class StateAbstraction:
 
 @dataclass(frozen=True)
 class _Changes:
-    """Changes of a factor; each distinct change, a pair of current and different next value, is a cell.
+    """Changes of a factor. Each distinct change (current value, next value that differs from it) is a cell.
 
     Attributes:
-        value: index of the current value of each row, int64 [N].
+        value: index of each row's current value among the distinct values, int64 [N].
         cell: index of each row's cell, -1 if the factor did not change, int64 [N].
-        start: index of the current value of each cell, int64 [C].
+        start: index of each cell's current value, as in ``value``, int64 [C].
         pairs: current and next value of each cell, [C, 2].
     """
 
@@ -115,12 +115,12 @@ def thinned(before: Values, actions: Actions, after: Values, most: int = MOST_CO
 def find_controllable(before: Values, actions: Actions, after: Values, n_actions: int) -> Controllable:
     """Tests which of F factors, and which of their changes, depend on actions.
 
-    For each change it is tested by beta-binomial evidence whether its probability, given the factor's current value, differs
-    between one action and the others, always or while another factor has some value. A factor depends on actions if the
-    evidence of one of its changes, or of many together, is sufficient.
+    For each change, beta-binomial tests compare its probability, given the factor's current value, between one action and the
+    others. Each comparison is made over all transitions and over those in which another factor has a particular value. A factor
+    depends on actions if there is sufficient evidence from one of its changes or from many together.
 
     Args:
-        before: states, integers of any width [N, F].
+        before: states [N, F], of any integer type.
         actions: int64 [N].
         after: next states, as ``before``.
         n_actions: number of actions A.
@@ -152,9 +152,10 @@ def find_controllable(before: Values, actions: Actions, after: Values, n_actions
 
 
 def _dependent_in_contexts(changes: Mapping[int, _Changes], before: Values, actions: Actions, n_actions: int) -> dict[int, Bools]:
-    """For each factor, which of its cells depend on the action given the value of another factor.
+    """For each factor, bool [C]: whether each of its cells depends on the action given some value of another factor.
 
-    A value that is reached from the left by one action and from the right by another does not depend on the action alone.
+    For example, an object may enter a position from the left by one action and from the right by another: this change does not
+    depend on the action alone.
     """
     result, factors = {f: np.zeros(len(change.start), dtype=np.bool_) for f, change in changes.items()}, list(changes)
     rows = (
@@ -185,7 +186,7 @@ def _dependent_in_contexts(changes: Mapping[int, _Changes], before: Values, acti
 
 
 def _classes(pairs: Ints, n_changes: Ints, dependent: Bools, *observed: NDArray[Any]) -> dict[int, int]:
-    """The lowest value of each value's class; changes that depend on actions, or are too rare to tell, do not join classes."""
+    """Maps each value to the lowest value in its class; changes that are rare or depend on actions join no classes."""
     both: dict[tuple[int, int], int] = {}
     apart = {(min(pair), max(pair)) for pair in pairs[dependent].tolist()}
     for pair, n in zip(pairs.tolist(), n_changes.tolist(), strict=True):
@@ -204,7 +205,8 @@ def _classes(pairs: Ints, n_changes: Ints, dependent: Bools, *observed: NDArray[
 def find_reached(found: Controllable, before: Values, actions: Actions, after: Values) -> Bools:
     """Factors that depend on actions directly or through other such factors, bool [F].
 
-    Tested as in ``find_controllable``: whether the probability of a change depends on a value of the other factor.
+    The test is that of ``find_controllable``, but compares a change's probability between one value of another factor and its
+    other values.
     """
     before, _, after = thinned(before, actions, after, MOST_COUNTED_STEPS // 2)
     changes, reached, new = _all_changes(before, after), found.directly.copy(), found.directly
@@ -242,9 +244,10 @@ def _changes_of(before: NDArray[Any], after: NDArray[Any]) -> _Changes:
 
 
 def _columns(numbers: list[Ints], most: int, even: bool = False) -> tuple[NDArray[np.float32], Ints]:
-    """Indicator columns float32 [N, C] of the most frequent numbers except -1, with each one's entry in the list and number.
+    """(indicator columns float32 [N, C] of the most frequent numbers except -1, (list index, number) of each [C, 2]).
 
-    With ``even``, numbers that divide the rows most evenly are preferred, and factors with two values get one indicator only.
+    With ``even``, the numbers that split the rows most evenly are chosen instead, and a list entry with two distinct numbers
+    gets only one column.
     """
     found: list[tuple[int, int, int]] = []
     for i, row in enumerate(numbers):
@@ -266,21 +269,21 @@ def _columns(numbers: list[Ints], most: int, even: bool = False) -> tuple[NDArra
 
 @cache
 def _log_gammas() -> Floats:
-    """Log gamma of 1/2, 3/2, ..., minus that of 1/2; second row: of 1, 2, 3, ...; [2, MOST_COUNTED_STEPS + 1]."""
+    """[2, MOST_COUNTED_STEPS + 1]: log gamma(i + 1/2) - log gamma(1/2) in row 0, log gamma(i + 1) in row 1, i from 0."""
     halves = np.concatenate([[0.0], np.cumsum(np.log(np.arange(MOST_COUNTED_STEPS) + 0.5))])
     wholes = np.concatenate([[0.0], np.cumsum(np.log(np.arange(MOST_COUNTED_STEPS) + 1.0))])
     return np.stack([halves, wholes])
 
 
 def _log_marginal(k: Ints, n: Ints) -> Floats:
-    """Log marginal likelihood of a sequence of n rows with k changes, by Jeffreys' prior."""
+    """Log marginal likelihood of a sequence of n rows with k changes, under Jeffreys' prior."""
     halves, wholes = _log_gammas()
     result: Floats = halves[k] + halves[n - k] - wholes[n]
     return result
 
 
 def _evidence(k: Ints, n: Ints, all_k: Ints | None = None, all_n: Ints | None = None) -> Floats:
-    """Log evidence [C, G] that the probability of changes under a condition differs from that in the other rows.
+    """Log evidence (Bayes factor) [C, G] that a change's probability under a condition differs from that in other rows.
 
     Args:
         k: number of changes under each condition, int64 [C, G].
@@ -294,7 +297,7 @@ def _evidence(k: Ints, n: Ints, all_k: Ints | None = None, all_n: Ints | None = 
 
 
 def _factor_evidence(logs: Floats) -> Floats:
-    """Log evidence [G] that a factor depends on each condition, from that of its changes [C, G]: of one alone, or of a share."""
+    """Log evidence [G] that a factor depends on a condition: maximum of ``logs`` [C, G], or a mixture of all if larger."""
     together = np.logaddexp(math.log(1.0 - LEAST_SHARE), math.log(LEAST_SHARE) + logs).sum(axis=0)
     result: Floats = np.maximum(logs.max(axis=0), together)
     return result

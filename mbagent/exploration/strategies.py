@@ -36,14 +36,14 @@ START_NODE = 0
 
 
 class VisitArrays(Struct):
-    """Arrays of a VisitTable for compiled code, with spare capacity; N nodes and M outcomes are in use.
+    """Arrays of a VisitTable for compiled code. Each ``room`` is a capacity, of which N nodes or M outcomes are in use.
 
     Attributes:
-        tried: visit count of each action, int64 [room, A]; of node START_NODE, in column 0, the number of episodes begun.
+        tried: visit count of each (node, action), int64 [room, A]; in row START_NODE, column 0 is the number of episodes begun.
         first: index of the first outcome of each (node, action), -1 if there is none, int64 [room, A].
-        worth: value of each node, the discounted sum of bonuses from it on, float64 [room].
-        target: the node to which an outcome leads, int64 [room].
-        times: number of times that the outcome was observed, int64 [room].
+        worth: value of each node: the expected discounted sum of bonuses from that node on, float64 [room].
+        target: the node to which each outcome leads, int64 [room].
+        times: number of times that each outcome was observed, int64 [room].
         following: index of the next outcome of the same (node, action), -1 after the last one, int64 [room].
         sizes: N and M, int64 [2].
     """
@@ -58,13 +58,13 @@ class VisitArrays(Struct):
 
 
 class VisitTable:
-    """Visit counts of all observed states, and the actions that lead to rarely tried pairs. Rewards are not used.
+    """Visit counts of observed states, and actions that lead to rarely tried (state, action) pairs; uses no rewards.
 
-    The empirical MDP of the observed states is solved for a bonus of 1 / sqrt(n) for a (state, action) tried n times (Strehl &
-    Littman 2008, here without rewards), by value iteration that continues for a few updates at every step. Untried actions
-    have a higher value than all others. The value at the end of an episode is that of the start states: otherwise terminal
-    states would appear to have no exploration value. The same applies to truncation, since an agent that is stuck continues
-    in a new episode.
+    The empirical MDP of the observed states is solved with a bonus of 1 / sqrt(n) for each (state, action) tried n times (Strehl
+    & Littman 2008, here without rewards). Value iteration solves it incrementally, with a few updates at every step. Untried
+    actions have a higher value than all others. The value at the end of an episode is that of the start states: otherwise
+    terminal states would appear to have no exploration value. Truncated episodes are treated in the same way, since an agent
+    that is stuck continues in a new episode.
 
     Args:
         n_actions: number of enumerated actions A.
@@ -83,7 +83,7 @@ class VisitTable:
         return int(self._arrays.sizes[0]) - 1
 
     def add(self, states: States) -> Ints:
-        """The nodes int64 [B] of states int64 [B, F], added if they are new."""
+        """The nodes, int64 [B], of states int64 [B, F]; new states are added first."""
         nodes, known = np.empty(len(states), dtype=np.int64), self._nodes
         for b, row in enumerate(np.ascontiguousarray(states, dtype=np.int64)):
             nodes[b] = known.setdefault(row.tobytes(), len(known) + 1)
@@ -93,11 +93,11 @@ class VisitTable:
         return nodes
 
     def begin(self, nodes: Ints) -> None:
-        """Records starts of episodes at these nodes [B]."""
+        """Records that one episode started at each of ``nodes`` [B]."""
         self._count(np.full(len(nodes), START_NODE), np.zeros(len(nodes), dtype=np.int64), nodes)
 
     def record(self, nodes: Ints, actions: Actions, targets: Ints) -> None:
-        """Records that actions [B] taken at nodes [B] led to ``targets`` [B], which are START_NODE if the episode ended."""
+        """Records that ``actions`` [B] at ``nodes`` [B] led to ``targets`` [B] (START_NODE where an episode ended)."""
         self._count(nodes, actions, targets)
 
     def _count(self, nodes: Ints, actions: Actions, targets: Ints) -> None:
@@ -114,7 +114,7 @@ class VisitTable:
             getattr(self._arrays, field.name)[: len(before)] = before
 
     def counts(self, states: States) -> Ints:
-        """Visit count of each action in states [B, F], int64 [B, A]."""
+        """Visit counts int64 [B, A] of each action in ``states`` [B, F]."""
         keys = [row.tobytes() for row in np.ascontiguousarray(states, dtype=np.int64)]
         found = np.array([self._nodes.get(key, -1) for key in keys], dtype=np.int64)
         return np.where(found[:, None] >= 0, self._arrays.tried[found], 0)
@@ -124,9 +124,9 @@ class VisitTable:
         return int((self._arrays.tried[1 : len(self) + 1] > 0).sum())
 
     def choose(self, nodes: Ints, noise: Floats) -> Actions:
-        """Actions int64 [B] of the highest value, after some updates of value iteration.
+        """The action with the highest value at each node, int64 [B], after some updates of value iteration.
 
-        Rows at the same node distribute over its actions, since an action chosen for one row counts as tried for later rows.
+        Rows at the same node tend to get different actions, since an action chosen for one row counts as tried for later rows.
 
         Args:
             nodes: int64 [B].
@@ -152,7 +152,7 @@ def _room(n_actions: int, n_nodes: int, n_outcomes: int) -> VisitArrays:
 
 @compiled
 def _record(table: VisitArrays, nodes: Ints, actions: Actions, targets: Ints) -> None:
-    """Counts an outcome of each row; the arrays must have spare capacity."""
+    """Counts one outcome for each row; the arrays must have enough spare capacity."""
     for b in range(len(nodes)):
         node, a = nodes[b], actions[b]
         table.tried[node, a] += 1
@@ -172,7 +172,7 @@ def _record(table: VisitArrays, nodes: Ints, actions: Actions, targets: Ints) ->
 
 @compiled
 def _mean(table: VisitArrays, node: int, action: int) -> tuple[float, int]:
-    """Mean value of the observed outcomes of an action that was tried, and the number of distinct ones."""
+    """(mean value of a tried action's observed outcomes, number of distinct outcomes)."""
     total, counted, outcome = 0.0, 0, table.first[node, action]
     while outcome >= 0:
         total += table.times[outcome] * table.worth[table.target[outcome]]
@@ -183,7 +183,7 @@ def _mean(table: VisitArrays, node: int, action: int) -> tuple[float, int]:
 
 @compiled
 def _improve(table: VisitArrays, work: int, at: int, upwards: bool) -> tuple[int, bool]:
-    """Sweeps up and down over the nodes in turn, in place, from node ``at`` on; returns node and direction to continue with."""
+    """Updates values in place, sweeping up and down the nodes from ``at``; returns (next node, whether upwards)."""
     n = table.sizes[0]
     for _ in range(2 * n):
         if at == START_NODE:
@@ -212,7 +212,7 @@ def _improve(table: VisitArrays, work: int, at: int, upwards: bool) -> tuple[int
 
 @compiled
 def _choose(table: VisitArrays, nodes: Ints, noise: Floats, at: int, upwards: bool, actions: Actions) -> tuple[int, bool]:
-    """Fills ``actions`` [B], see VisitTable.choose; later rows count each as tried. Returns what _improve does."""
+    """Fills ``actions`` [B] as described in VisitTable.choose; returns the result of ``_improve``."""
     at, upwards = _improve(table, WORK, at, upwards)
     for b in range(len(nodes)):
         best = -np.inf
@@ -249,7 +249,7 @@ class Exploration(Protocol):
     """Chooses the actions of the learning phase."""
 
     def act(self, states: States, rng: np.random.Generator) -> Actions:
-        """Action numbers int64 [B] for states int64 [B, F], numbered as declared (see FactoredSpace)."""
+        """Action numbers int64 [B] for states int64 [B, F] in declared numbers (see FactoredSpace)."""
         ...
 
 
@@ -261,7 +261,7 @@ class Watching(Protocol):
         """Records one step of each environment.
 
         Args:
-            states: int64 [B, F], numbered as declared.
+            states: int64 [B, F], in declared numbers (FactoredSpace).
             actions: int64 [B].
             next_states: int64 [B, F]; if an episode ended, its last state.
             ended: whether the episode was terminated or truncated, bool [B].
@@ -288,12 +288,12 @@ class RandomExploration:
 class PersistentExploration:
     """Random actions, each of which is repeated with probability ``keep`` at every step.
 
-    For environments in which single actions have little effect, such as discretised continuous ones: pushes in alternating
-    directions cancel each other.
+    For environments in which single actions have little effect, such as discretised continuous ones, where pushes in alternating
+    directions cancel out.
 
     Args:
         n_actions: number of enumerated actions.
-        keep: probability that the last action is repeated, at least 0 and below 1.
+        keep: probability of repeating the last action, in [0, 1).
 
     Raises:
         ValueError: ``keep`` is out of range.
@@ -317,18 +317,18 @@ class PersistentExploration:
 
 
 class DirectedExploration:
-    """Exploration by visit counts, directed at the pairs tried least; uniformly random if there are too many states.
+    """Count-based exploration of the least-tried state-action pairs; uniformly random if there are too many states.
 
     It is far better than random actions where these seldom get far (holes, cliffs, long corridors, tasks of several steps in the
     right order). It needs states that recur, since a table of visits has no information on unobserved states. If there are too
-    many states, it tests each time the number of steps has doubled whether there are few abstract states of controllable factors
-    (see ``controllability.py``), and counts only these: uncontrollable distractors make almost every state novel, but are
+    many, then whenever the number of steps has doubled, it tests whether controllable factors form few abstract states (see
+    ``controllability.py``); if so, it counts only these: uncontrollable distractors make almost every state novel, but are
     irrelevant for exploration.
 
     Args:
         n_actions: number of enumerated actions.
-        few: True to be directed only while states are few, at most FEW_STATES + steps / STEPS_PER_STATE distinct ones; False to
-            be directed up to MANY_STATES. Otherwise actions are those of RandomExploration.
+        few: True to be directed only up to FEW_STATES + steps / STEPS_PER_STATE distinct states; False to be directed up to
+            MANY_STATES. Otherwise actions are those of RandomExploration.
 
     Attributes:
         table: visit counts; None after more than MANY_STATES states, until an abstraction with fewer states is found.
@@ -372,7 +372,7 @@ class DirectedExploration:
         self._add_steps(_Steps(states, actions, next_states, self._ended, began))
 
     def recall(self, rows: TransitionBatch) -> None:
-        """Records transitions that it did not observe; all their episodes must have ended."""
+        """Records transitions observed elsewhere; all their episodes must have ended."""
         rows = rows.select(np.argsort(rows.episodes, kind="stable"))
         change = rows.episodes[1:] != rows.episodes[:-1]
         self._add_steps(_Steps(rows.before, rows.actions, rows.after, np.append(change, True), np.append(True, change)))
@@ -408,7 +408,7 @@ class DirectedExploration:
             self.table = None
 
     def _keep(self, kept: list[_Steps]) -> None:
-        """Keeps steps for later tests; if they exceed MANY_VALUES, makes a last test and discards all of them."""
+        """Keeps steps for later tests; if they exceed MANY_VALUES, runs a last test and discards them all."""
         kept.append(_joined(self._unkept).narrowed())
         self._unkept, self._n_unkept = [], 0
         self._n_kept += 2 * kept[-1].states.size
@@ -419,7 +419,7 @@ class DirectedExploration:
     def _reconsider(self) -> None:
         """Chooses the finest of three state representations with few distinct states.
 
-        Finest first: all factors; the factors that actions reach directly or through others; what depends on actions directly.
+        Finest first: all factors; those that actions affect, directly or through others; those that actions affect directly.
         """
         if self._kept is None or (self.view is None and self.directed):
             return
@@ -442,7 +442,7 @@ class DirectedExploration:
 
 
 class _Steps(NamedTuple):
-    """Steps [N]: states int [N, F], actions, next states, whether an episode ended with the step, or began with it."""
+    """Steps [N]: states int [N, F], actions, next states, whether each step ended an episode, whether it began one."""
 
     states: NDArray[np.integer[Any]]
     actions: Actions
@@ -467,7 +467,7 @@ def _distinct(states: NDArray[np.integer[Any]]) -> int:
 
 
 def catch_up(exploration: Exploration, data: TransitionDataset) -> None:
-    """Passes transitions that directed exploration did not observe to it, such as those from a file."""
+    """Passes directed exploration transitions that it did not observe, such as those from a file."""
     if isinstance(exploration, DirectedExploration) and exploration.n_steps < len(data):
         exploration.recall(data.rows().select(slice(exploration.n_steps, None)))
 

@@ -57,7 +57,7 @@ class BaseTransitionModel(ABC):
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
         """Successors for planning: ``n_samples`` samples for each row, equal ones merged.
 
-        All rows share their random numbers, so that actions and states differ only by their effects.
+        All rows share random numbers, so that actions and states differ only in their effects.
 
         Args:
             states: int64 [B, F].
@@ -92,7 +92,7 @@ class BaseTransitionModel(ABC):
             seed: of the random numbers.
 
         Raises:
-            ValueError: there are fewer samples, which have no variance.
+            ValueError: ``n_samples`` is less than 2.
 
         Returns:
             (mean [B, ...], variance [B, ...]), the unbiased sample moments.

@@ -1,4 +1,4 @@
-"""Reports of fits: sizes, held-out figures of each variable, and calibration."""
+"""Fit reports: data sizes, held-out metrics of each variable, and calibration."""
 
 from __future__ import annotations
 
@@ -17,14 +17,16 @@ BINS = 10
 
 @dataclass(frozen=True)
 class VariableReport:
-    """Quality of the predictions of one variable: a factor, a mutex group of bits, or a channel of planes.
+    """Prediction quality for one variable: a factor, a mutex group of bits, or a channel of planes.
 
     Attributes:
-        name: of the variable.
+        name: name of the variable.
         factors: indices of its factors.
-        log_likelihood: sum over its factors of the mean held-out log-probability of the next value, nats per transition.
-        calibration: mean distance of predicted probabilities from frequencies, 0 ... 1 (expected calibration error).
-        parents: variables other than itself, and the action, on which its next value depends in the model.
+        log_likelihood: mean held-out log-probability of the next value, summed over the variable's factors, in nats per
+            transition.
+        calibration: expected calibration error, the mean absolute difference between predicted probabilities and observed
+            frequencies, 0 ... 1.
+        parents: the other variables, and possibly the action, on which the model's prediction of the next value depends.
     """
 
     name: str
@@ -40,17 +42,18 @@ class FitReport:
 
     Attributes:
         n_train: number of rows used for the fit.
-        n_validation: number of held-out rows, in whole episodes.
+        n_validation: number of held-out rows, from whole episodes if there are enough.
         epochs: passes over the data before early stopping.
         seconds: wall time.
         predictor_loss: held-out cross-entropy of the predictor, nats per transition (None: the model has no predictor).
-        conditioner_loss: the same of the conditioner given the true other variables (None: no conditioner).
-        exact_match: share of held-out transitions whose most likely next state is the observed one.
-        log: further figures, for the logger.
-        variables: reports of the variables that changed in the data; empty if the model has no such reports.
-        calibration: mean distance of all predicted probabilities from frequencies; None likewise.
-        memory: improvement of predictions given the previous step in addition to current state and action, nats per transition;
-            0 if it is not significant, None if it was not tested.
+        conditioner_loss: the same for the conditioner, given the observed next values of the other variables (None: no
+            conditioner).
+        exact_match: share of held-out transitions for which the model's most likely next state is the observed one.
+        log: further metrics, for the logger.
+        variables: reports on the variables that changed in the data; empty if the model does not provide them.
+        calibration: expected calibration error of all predicted probabilities; None if it was not computed.
+        memory: gain in held-out log-likelihood from using the previous step in addition to the current state and action, in nats
+            per transition; 0 if the gain is small or not significant, None if it was not tested.
     """
 
     n_train: int
@@ -76,7 +79,7 @@ class FitReport:
         )
 
     def table(self, most: int = 20) -> str:
-        """The variables with the lowest log-likelihood, as text."""
+        """Text table of the ``most`` variables with the lowest log-likelihood."""
         worst = sorted(self.variables, key=lambda variable: variable.log_likelihood)[:most]
         lines = [f"{'variable':24} {'log-likelihood':>14} {'calibration':>11}  depends on"]
         for variable in worst:
@@ -87,9 +90,10 @@ class FitReport:
 
 
 def calibration_error(probabilities: Floats, came: NDArray[np.bool_]) -> float:
-    """Expected calibration error (Naeini et al. 2015) of probabilities, given outcomes of the same shape.
+    """Expected calibration error (Naeini et al. 2015) of predicted probabilities, given which outcomes came true (same shape).
 
-    Distance of the mean probability from the observed frequency, averaged over bins weighted by their numbers of predictions.
+    The absolute difference between the mean probability and the observed frequency in each bin is averaged over bins, weighted
+    by their number of predictions.
     """
     bins = np.minimum((probabilities.ravel() * BINS).astype(np.int64), BINS - 1)
     predicted = np.bincount(bins, weights=probabilities.ravel(), minlength=BINS)
@@ -99,7 +103,7 @@ def calibration_error(probabilities: Floats, came: NDArray[np.bool_]) -> float:
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable to report: its name, factors and parents."""
+    """A variable to report on: its name, factors and parents."""
 
     name: str
     factors: tuple[int, ...]
@@ -109,11 +113,11 @@ class Variable:
 def describe(
     cardinalities: Sequence[int], probabilities: Floats, rows: TransitionBatch, variables: Sequence[Variable]
 ) -> tuple[tuple[VariableReport, ...], float | None]:
-    """Held-out figures of each variable, and the calibration of all.
+    """Held-out metrics of each variable, and the calibration of all predictions.
 
     Args:
         cardinalities: number of values of each factor, length F.
-        probabilities: each factor's distribution, [N, sum of cardinalities].
+        probabilities: each factor's predicted distribution, concatenated, [N, sum of cardinalities].
         rows: the N held-out transitions.
         variables: the variables to report.
     """

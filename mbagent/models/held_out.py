@@ -1,7 +1,7 @@
-"""Comparison of candidate models on held-out transitions, for which evenly spaced subsets suffice, and the Markov test.
+"""Comparison of candidate models on held-out transitions, thinned to evenly spaced subsets, and data for the Markov test.
 
-The test asks whether the previous step improves predictions given the current state and action. If it does, the observation is
-not the whole state, and ``mbagent.wrappers.History`` adds the past to it.
+The test asks whether adding the previous step to the current state and action improves predictions. If it does, the observation
+is not the whole state; ``mbagent.wrappers.History`` adds past steps to the observation.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ PART = 2000
 
 
 def following_steps(rows: TransitionBatch) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices of the transitions that follow another one in the same episode, and of their predecessors.
+    """Indices of the transitions that directly follow another one in the same episode, and indices of their predecessors.
 
     Episodes may be interleaved.
     """
@@ -80,17 +80,17 @@ def with_past(
     encoding: ActionEncoding,
     board: PlaneLayout | None,
 ) -> tuple[FactoredSpace, TransitionBatch]:
-    """Transitions whose states include the state and action of their predecessors.
+    """Transitions whose states also include the previous state and action.
 
     Args:
         now: the transitions.
         before: their predecessors.
         cardinalities: number of values of each factor.
-        encoding: of the actions.
-        board: layout of the factors if they form planes, so that the past is added as further planes; else None.
+        encoding: the action encoding.
+        board: layout of the planes, to which the past is added as further planes; None if the factors do not form planes.
 
     Returns:
-        (the space of states with a past, the transitions).
+        (the space of the extended states, the extended transitions).
     """
     shape: tuple[int, ...] = (len(cardinalities),) if board is None else (board.channels, board.height, board.width)
 

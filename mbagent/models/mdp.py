@@ -1,7 +1,8 @@
-"""The graph of expanded states, and the MDP of all states that a model can reach (paper section 2).
+"""The state graph, and the MDP of all states that a model can reach (paper section 2).
 
-The reachable MDP and the search tree are both such graphs: a state reached on two paths is one node. Nodes belong to *groups*: no
-edge leads from one group to another, so that the plan for one observation cannot depend on the others of its batch.
+The reachable MDP and the search tree are both state graphs: a state reached by two paths is one node. Each node belongs to a
+*group*. No edge leads from one group to another, so that the plan for one observation cannot depend on the other observations in
+the batch.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ NODES_AT_ONCE = 16_384
 
 
 class GraphArrays(Struct):
-    """The arrays of a graph for compiled kernels, with spare capacity; N nodes and M edges are in use.
+    """The arrays of a state graph for compiled kernels. N nodes and M edges are in use; the capacity (room) may be larger.
 
     Attributes:
         states, groups, expanded, first, counts, left_out: see StateGraph, [room, ...].
-        reached: whether a transition that does not end the episode leads to the node, bool [room].
+        reached: whether any non-terminal transition leads to the node, bool [room].
         tags: hash of each node's state and group, uint64 [room].
         next_nodes, probabilities, terminated, sources, actions: see StateGraph, [room].
         slots: hash table of the nodes, -1 where free, int64 [a power of two].
-        weights: of the hash, uint64 [F].
+        weights: hash weights, uint64 [F].
         sizes: N and M, int64 [2].
     """
 
@@ -145,7 +146,7 @@ def _expand_all(
 
 @compiled
 def _append(graph: GraphArrays, nodes: Ints, offsets: Ints, states: States, terminated: Bools, probabilities: Floats) -> None:
-    """Appends successors listed by a model: those of nodes[i] under action a are row i * A + a of the compressed rows."""
+    """Appends successors listed by a model; row i * A + a of the compressed rows holds those of ``nodes[i]`` under action a."""
     n_actions = graph.counts.shape[1]
     for i in range(len(nodes)):
         for a in range(n_actions):
@@ -192,7 +193,7 @@ _EDGE_FIELDS = ("next_nodes", "probabilities", "terminated", "sources", "actions
 
 
 class StateGraph:
-    """States, and for every expanded (state, action) its successors.
+    """States, and the successors of every expanded state under each action.
 
     Shapes: N nodes, A actions, F factors, M successors in all. The successors of node i under action a are at
     ``first[i, a] : first[i, a] + counts[i, a]`` of the successor arrays.
@@ -205,9 +206,9 @@ class StateGraph:
         first, counts: int64 [N, A].
         left_out: float64 [N, A], probability of rare successors that were merged with others, see ``systematic_sampling.py``.
         next_nodes: int64 [M]. probabilities: float64 [M]. terminated: bool [M].
-        sources: int64 [M], the node of which each entry is a successor. actions: int64 [M].
-        arrays: the same for compiled kernels, with spare capacity.
-        kernel: the model's arrays for compiled kernels; None if it has none.
+        sources: int64 [M], the predecessor node of each entry. actions: int64 [M].
+        arrays: the same arrays for compiled kernels, with spare capacity.
+        kernel: the model's arrays for compiled search; None if the model has none.
     """
 
     def __init__(self, model: TransitionModel) -> None:
@@ -237,7 +238,7 @@ class StateGraph:
         return int(self.arrays.sizes[1])
 
     def __getattr__(self, name: str) -> NDArray[Any]:
-        """Views of the parts of the arrays that are in use."""
+        """View of the part of an array that is in use."""
         if name in _NODE_FIELDS or name in _EDGE_FIELDS:
             array: NDArray[Any] = getattr(self.arrays, name)
             return array[: self.arrays.sizes[0 if name in _NODE_FIELDS else 1]]
@@ -282,13 +283,13 @@ class StateGraph:
         return nodes
 
     def find(self, states: States, group: int = 0) -> Ints:
-        """Nodes [B] of states [B, F] in one group; -1 for states that are not in it."""
+        """Nodes [B] of states [B, F] in one group; -1 for states that this group does not contain."""
         nodes = np.empty(len(states), dtype=np.int64)
         _find_all(self.arrays, np.ascontiguousarray(states, dtype=np.int64), group, nodes)
         return nodes
 
     def expand(self, nodes: Ints, n_samples: int, seed: int) -> Ints:
-        """Adds the model's successors of unexpanded, distinct ``nodes`` [B] under every action.
+        """Expands ``nodes`` [B], which must be distinct and unexpanded: adds their successors under every action.
 
         Returns:
             the new nodes, in order of appearance, int64.
@@ -327,7 +328,7 @@ class StateGraph:
 
 
 def _longer(array: NDArray[Any], used: int, size: int) -> NDArray[Any]:
-    """A copy of the first ``used`` rows with capacity for ``size``; rows never written do not occupy memory yet."""
+    """An array of ``size`` rows that begins with a copy of the first ``used`` rows; unwritten rows do not occupy memory yet."""
     longer = np.empty((size, *array.shape[1:]), dtype=array.dtype)
     longer[:used] = array[:used]
     return longer
@@ -335,12 +336,12 @@ def _longer(array: NDArray[Any], used: int, size: int) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class ReachableMDP:
-    """States, and for each (state, action) the successors with probability and terminated; no rewards.
+    """States, and the successors of each (state, action) with their probabilities and ``terminated``; no rewards.
 
     Attributes:
         states: int64 [N, F], the start states first.
         offsets: int64 [N, A + 1]; successors of state i under action a are ``offsets[i, a] : offsets[i, a + 1]``.
-        next_states: int64 [M], indices of states.
+        next_states: int64 [M], indices into ``states``.
         probabilities: float64 [M].
         terminated: bool [M].
         complete: whether every reachable state was expanded within the budget. If not, the MDP is partial: states that were
@@ -368,12 +369,12 @@ def grow_reachable(
         model: transition model.
         start: int64 [B, F].
         max_states: maximum number of expanded states.
-        n_samples: samples for a (state, action) with too many successors to enumerate; fewer if there are so many actions that
-            their outcomes would take too much memory (MOST_ROOM).
-        seed: of the random numbers of these samples.
+        n_samples: number of samples for a (state, action) with too many successors to enumerate; reduced if there are so many
+            actions that their outcomes would need too much memory (MOST_ROOM).
+        seed: seed of these samples.
 
     Returns:
-        (graph with one group 0, whether every reachable state was expanded).
+        (graph whose only group is 0, whether every reachable state was expanded).
     """
     n_samples = max(1, min(n_samples, MOST_ROOM // (2 * model.n_actions**2)))
     graph = StateGraph(model)

@@ -1,8 +1,8 @@
 """Model error: calibrated probability that a model's most likely prediction is wrong (the paper's section 6).
 
-A model estimates how random the environment is, but not its own error. Models fitted without different parts of the episodes
-disagree where data are scarce (the jackknife). The frequency of wrong predictions on held-out parts, as a function of the error
-that these models predict on average, is the calibrated probability (isotonic regression; Zadrozny and Elkan 2002).
+A model estimates how random the environment is, but not its own error. Models fitted with a different part of the episodes left
+out each time (the jackknife) disagree where data are scarce. Isotonic regression (Zadrozny and Elkan 2002) maps the error that
+these models predict on average to the frequency of wrong predictions on held-out parts, which is the calibrated probability.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class ModelError:
 
     Attributes:
         model: the model.
-        members: models fitted to its data without one part each.
+        members: models fitted to the same data, each with a different part left out.
         doubts: doubts at the points of the calibration curve, ascending, [K].
         rates: frequency of wrong predictions at these doubts, [K].
     """
@@ -42,7 +42,7 @@ class ModelError:
     rates: Floats
 
     def __call__(self, states: States, actions: Actions) -> Floats:
-        """Probability that the next state is not the model's likeliest one, by chance or by model error, [B]."""
+        """Probability that the outcome is not the model's most likely one, by chance or because of model error, [B]."""
         return np.interp(self.doubt(states, actions), self.doubts, self.rates)
 
     def doubt(self, states: States, actions: Actions) -> Floats:
@@ -73,11 +73,11 @@ def estimate_error(
     Args:
         build: creates an unfitted model of the same kind.
         model: the model, fitted to ``data``; it needs exact probabilities.
-        data: the transitions that it was fitted to.
-        n_members: number of further models to compare with it. The episodes are divided into this many parts, and each member
-            is fitted without one of them. For the calibration, a model is fitted without each pair of parts: 15 fits in all
-            for 5 members.
-        seed: of fits and parts.
+        data: the transitions that ``model`` was fitted to.
+        n_members: number of members, the models that are compared with ``model``. The episodes are divided into ``n_members``
+            parts, and each member is fitted without one of the parts. For the calibration, a further model is fitted without
+            each pair of parts, so 5 members need 15 fits in all.
+        seed: seed of the fits and parts.
 
     Raises:
         ValueError: there are fewer than 50 transitions, or fewer than 3 members.
@@ -148,14 +148,14 @@ def likeliest(model: TransitionModel, states: States, actions: Actions) -> tuple
 
 
 def missed(model: TransitionModel, rows: TransitionBatch) -> Bools:
-    """Rows whose outcome is not the model's likeliest one, bool [N]."""
+    """Whether each row's outcome is not the model's most likely one, bool [N]."""
     following, ends = likeliest(model, rows.states, rows.actions)
     result: Bools = (following != rows.next_states).any(axis=1) | (ends != rows.terminated)
     return result
 
 
 def _calibrated(doubts: Floats, wrong: Bools) -> tuple[Floats, Floats]:
-    """Calibration curve: doubts and error rates, both ascending; with few held-out transitions close to the identity.
+    """Calibration curve: doubts and error rates, both ascending; close to the identity if there are few held-out transitions.
 
     Doubts with the same rate are replaced by their mean, so that the curve strictly increases (Oron and Flournoy 2017).
     """

@@ -26,7 +26,7 @@ LARGEST_NUMBER = 2**62
 
 @dataclass(frozen=True)
 class Successors:
-    """Possible next states of each row, in compressed rows: those of row b are ``offsets[b]:offsets[b + 1]``.
+    """Possible next states of each row, in CSR layout: those of row b are ``offsets[b]:offsets[b + 1]``.
 
     Attributes:
         offsets: int64 [B + 1].
@@ -50,14 +50,14 @@ class Successors:
 class TransitionModel(Protocol):
     """A model of P(next state, terminated | state, action) for factored states.
 
-    Shapes: B batch, F factors. Actions are numbers of the enumerated actions.
+    Shapes: B batch, F factors. Actions are indices of enumerated actions.
     """
 
     cardinalities: tuple[int, ...]
     n_actions: int
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
-        """Fits the model to transitions, without rewards. ``progress`` is called with the share that is done, 0 ... 1."""
+        """Fits the model to transitions, without rewards. ``progress`` is called with the completed share, 0 to 1."""
         ...
 
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:

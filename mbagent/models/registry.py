@@ -46,7 +46,7 @@ def build_networks(space: FactoredSpace, n_actions: int, learning_rate: float) -
 
 
 def build_string(space: FactoredSpace, n_actions: int, learning_rate: float, n_steps: int) -> NeuralTransitionModel:
-    """A model of the state after ``n_steps`` steps, given the sequence of their actions as one action (paper 4.2)."""
+    """A model of the state after ``n_steps`` steps whose action sequence is treated as one action (paper 4.2)."""
     planes, cards = space.planes, space.cardinalities
     if planes is None:
         config = NeuralConfig(training=replace(TrainingConfig(), learning_rate=learning_rate))
@@ -65,9 +65,9 @@ def build_string(space: FactoredSpace, n_actions: int, learning_rate: float, n_s
 def build_direct(
     space: FactoredSpace, n_actions: int, learning_rate: float, steps: Sequence[int] | None = None
 ) -> DirectForecastModel:
-    """The model of ``build_networks`` and one further model for each number of steps in ``steps``.
+    """The model of ``build_networks``, and a further model for each step count in ``steps``.
 
-    By default those of ``DIRECT_STEPS`` for which the action sequences can be numbered.
+    Default: those of ``DIRECT_STEPS`` whose action sequences can be enumerated.
     """
     if steps is None:
         steps = [n for n in DIRECT_STEPS if n <= longest_string(n_actions)]

@@ -1,7 +1,7 @@
 """A reward model fitted to observed rewards, for environments whose reward function is not available.
 
-If decision graphs cannot separate the rewards, a network predicts them; dense ones are evaluated by compiled code, since a search
-scores thousands of transitions for a decision.
+If decision graphs cannot separate the rewards, a network predicts them; compiled code evaluates dense networks, since a search
+scores thousands of transitions per decision.
 """
 
 from __future__ import annotations
@@ -150,8 +150,8 @@ class RewardReport:
         right: share of transitions whose reward is the predicted mean, within 0.5% of the range of rewards, or the most probable
             one.
         held_out: the same for the episodes held out in the first fit, as measured then; NaN if there are none.
-        contrary: share of transitions with another reward than the most frequent one of those that cannot be distinguished: with
-            the same observation, action and next observation, or with the same prediction of decision graphs.
+        contrary: share of transitions whose reward is not the commonest among indistinguishable ones: those with the same
+            observation, action and next observation, or the same prediction of decision graphs.
         since: number of transitions before the last change of rewards; 0 if there was none. The other figures refer to the
             transitions whose rewards are still valid.
     """
@@ -225,7 +225,7 @@ class LearnedReward:
 
     @one_thread()
     def fit(self, rows: TransitionBatch) -> RewardReport:
-        """Fits the model to rows, in the order observed; if rewards changed, to those that are still valid."""
+        """Fits the model to rows, in the order observed; if rewards changed, only to rows still valid."""
         report = self._learn(rows)
         if report.right < 1.0 or report.held_out < 1.0:  # else no rows contradict each other
             since, hold = self._changed(rows)
@@ -234,7 +234,7 @@ class LearnedReward:
         return report
 
     def _learn(self, rows: TransitionBatch) -> RewardReport:
-        """Fits the model to most episodes first, to test it on the held-out ones, and then to all."""
+        """Fits the model to most episodes, tests it on the held-out ones, then fits it to all."""
         values = np.unique(rows.rewards)
         self._classes = len(values) <= MAX_CLASSES
         self._values = values if self._classes else np.array([values.mean(), max(values.std(), 1e-6)])
@@ -295,7 +295,7 @@ class LearnedReward:
         return self._share_right(tests), gain
 
     def _half_of_missed(self, rows: TransitionBatch) -> Bools:
-        """Rows of every second episode with rewards that graphs miss, bool [N]; none if graphs miss few."""
+        """Rows, in every second episode, with rewards graphs miss, bool [N]; none if graphs miss few."""
         before, self._graphs = self._graphs, self._as_graphs(rows)
         episodes = np.unique(rows.episodes[self._missed(rows)])
         self._graphs = before
@@ -369,7 +369,7 @@ class LearnedReward:
         return np.searchsorted(np.quantile(rewards, np.arange(1, MAX_GRAPHS) / MAX_GRAPHS), rewards)
 
     def _change_point(self, rows: TransitionBatch, keys: NDArray[np.int64], values: NDArray[np.int64]) -> int:
-        """The row from which rewards differ from those before, or 0."""
+        """First row whose rewards differ from earlier ones, or 0."""
         found = turn(keys, values, rows.episodes)
         half = len(rows) // 2
         if found or not self._few or np.isin(keys[half:], keys[:half]).mean() > 0.5:
@@ -527,9 +527,9 @@ class _PlaneReward(nn.Module):
 
 
 def _distinct(rows: TransitionBatch) -> tuple[TransitionBatch, NDArray[np.float32]]:
-    """Distinct (s, a, s', r), each weighted by its share among those of the same (s, a, s').
+    """Distinct (s, a, s', r), each weighted by its share of the rows with that (s, a, s').
 
-    So rare transitions have the same weight as frequent ones, and random rewards keep their distribution.
+    So rare transitions weigh as much as frequent ones, and random rewards keep their distribution.
     """
     keys, bits = triples(rows), np.ascontiguousarray(rows.rewards).view(np.int64)
     _, first, counts = np.unique(np.stack([keys, bits], axis=1), axis=0, return_index=True, return_counts=True)
@@ -539,7 +539,7 @@ def _distinct(rows: TransitionBatch) -> tuple[TransitionBatch, NDArray[np.float3
 
 
 def _expected_values(probabilities: Floats, values: Floats, floor: float = 0.0) -> Floats:
-    """Expected values [M] by probabilities [M, K], of which those below ``floor`` are set to 0."""
+    """Expected values [M] under probabilities [M, K]; those below ``floor`` are set to 0."""
     p = np.where(probabilities < floor, 0.0, probabilities)
     # Not a matrix product, whose rounding would depend on the number of rows.
     expected: Floats = (p / p.sum(axis=1, keepdims=True) * values).sum(axis=1)

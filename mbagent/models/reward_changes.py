@@ -1,9 +1,9 @@
 """Changes of rewards during ``learn``: when they occurred, and which older rewards are still valid.
 
 Random rewards contradict each other at all times; changed rewards contradict earlier ones from some step on. The evidence for
-such a step is the gain in log-probability if each group of similar transitions has one distribution of rewards before it and
-another one after it. It must far exceed the gain in permuted orders of the same episodes, so that an unobserved property of
-episodes is not mistaken for a change.
+such a step is the gain in log-probability if each group of similar transitions has one reward distribution before it and another
+after it. It must far exceed the gain in permuted orders of the same episodes, so that an unobserved property of episodes is not
+mistaken for a change.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def triples(rows: TransitionBatch) -> Ints:
 
 
 def wrong_until(rows: TransitionBatch, wrong: Bools) -> int | None:
-    """Number of rows before rewards changed to those of a function, which is ``wrong`` in earlier rows; None without change."""
+    """Number of rows before rewards changed to those of a function that is ``wrong`` in earlier rows; None if no change."""
     order, until = np.argsort(rows.episodes, kind="stable"), 0
     rows, flags = rows.select(order), wrong[order].astype(np.int64)
     keys = triples(rows)
@@ -47,7 +47,7 @@ def wrong_until(rows: TransitionBatch, wrong: Bools) -> int | None:
 
 
 def turn(groups: Ints, values: Ints, episodes: Ints) -> int:
-    """The row from which rewards differ from those before; 0 if there is no evidence of a change.
+    """First row from which rewards differ from earlier ones; 0 without evidence of a change.
 
     Args:
         groups: group of similar transitions to which each row belongs, int [N], in order of time, episode by episode.
@@ -104,7 +104,7 @@ def _gains(groups: Ints, labels: Ints, n_distinct: Ints) -> Floats:
 
 
 def _ranks(labels: Ints) -> tuple[Ints, Ints]:
-    """Number of rows before, and after, each row that have its label, int [N] twice."""
+    """Numbers of earlier and later rows with each row's label, int [N] each."""
     order, counts = np.argsort(labels, kind="stable"), np.bincount(labels)
     rank = np.empty(len(labels), dtype=np.int64)
     rank[order] = np.arange(len(labels)) - (np.cumsum(counts) - counts)[labels[order]]

@@ -1,4 +1,4 @@
-"""The true model: a game's own rules behind the protocol of transition models, for comparisons with learned models."""
+"""The true model: a game's own rules as a transition model, for comparison with learned models."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
 """Systematic and stratified sampling: the outcomes of a (state, action) from few samples, including rare outcomes.
 
 Variables are processed one after the other; each particle represents the values chosen so far. If all outcomes fit, they are
-listed with their exact probabilities. Otherwise particles are stratified. The *main* particles are runs of grid points, of which
-each value of a variable gets its share. A value too rare for the grid gets a particle of its own, a *stratum*: all outcomes in
-which this is the first rare value. It has the stratum's exact probability, and later variables are sampled. So every rare value
-of every variable is represented, the weights sum to one, and expected values are unbiased (stratified sampling, Cochran 1977).
-If there are more strata than slots, two are merged: one of them is kept, with probability proportional to its weight, and gets
-the weight of both. The stratum in which the episode ends is never merged with another.
+listed with their exact probabilities. Otherwise particles are stratified. The *main* particles are runs of grid points, divided
+among the values of each variable. A value too rare for the grid gets a particle of its own, a *stratum*: all outcomes in which
+this is the first rare value. It has the stratum's exact probability, and later variables are sampled. So every rare value of
+every variable is represented, the weights sum to one, and expected values are unbiased (stratified sampling, Cochran 1977). If
+there are more strata than slots, two are merged: one of them is kept, with probability proportional to its weight, and gets the
+weight of both. The stratum in which the episode ends is never merged with another.
 Shapes: n grid points, 2 n slots (main particles first, strata from slot n on), O open variables, K values.
 """
 
@@ -29,7 +29,7 @@ from mbagent_envs.structs import Struct
 
 @inlined
 def largest(probs: Floats, b: int, i: int, n: int) -> int:
-    """The most probable of the ``n`` values of factor i in row b; the lowest one if tied."""
+    """Most probable of the ``n`` values of factor i in row b; the lowest in a tie."""
     best = 0
     for k in range(1, n):
         if probs[b, i, k] > probs[b, i, best]:
@@ -163,7 +163,7 @@ def n_outcomes(p: Particles) -> int:
 
 @inlined
 def slot_of(p: Particles, i: int, n_grid: int) -> int:
-    """Slot of particle number i, where main particles come first."""
+    """Slot of the particle with index i, main particles first."""
     return int(i if i < p.state[MAIN] else n_grid + i - p.state[MAIN])
 
 
@@ -204,7 +204,7 @@ def bit_chances(one: float, values: Floats) -> None:
 
 @inlined
 def n_possible(values: Floats, start: int, n: int) -> int:
-    """Number of positive entries among ``n`` of ``values``, from ``start`` on."""
+    """Number of positive entries in ``values[start : start + n]``."""
     count = 0
     for k in range(start, start + n):
         if values[k] > 0.0:
@@ -216,8 +216,8 @@ def n_possible(values: Floats, start: int, n: int) -> int:
 def _separate_rare(values: Floats, rare: Floats, n: int, n_grid: int) -> float:
     """Moves the probabilities of rare values to ``rare`` [n] and normalises the others; returns the sum of the rare ones.
 
-    Rare values are below a bound of at most RARE_VALUE and ENOUGH_POINTS grid points, chosen such that their sum is below
-    RARE_TOGETHER; of equally probable values all are rare or none.
+    Rare values are below a bound of at most RARE_VALUE and ENOUGH_POINTS grid points, chosen so that their sum is below
+    RARE_TOGETHER; equally probable values are all rare or all not.
     """
     bound, total = min(RARE_VALUE, ENOUGH_POINTS / n_grid), RARE_TOGETHER
     while total >= RARE_TOGETHER:
@@ -243,8 +243,8 @@ def share_out(p: Particles, only: int, variable: int, w: int, values: Floats, n:
     Args:
         p: the particles.
         only: slot of one particle, if probabilities depend on its values so far (strata must precede main particles); -1 for all.
-        variable: number of the variable, for its random numbers.
-        w: number of the variable among the open ones: the column of ``Particles.factors`` for its values.
+        variable: index of the variable, for its random numbers.
+        w: index of the variable among the open ones: its column in ``Particles.factors``.
         values: probability of each value, summing to one, overwritten, [n].
         n: number of values.
         ends: whether the variable is ``terminated``.
@@ -356,7 +356,7 @@ def _slot_for(p: Particles, tag: int, ends: bool, n_grid: int) -> int:
 
 @compiled
 def _add_stratum(p: Particles, q: int, variable: int, k: int, w: int, weight: float, ends: bool, grid: Grid) -> None:
-    """Adds main particle q with value k of a variable to the strata, with the given weight."""
+    """Adds a stratum: main particle q with value k of a variable, with the given weight."""
     points, chances, factors, state = p.grid, p.chances, p.factors, p.state
     n_grid, key, _ = grid
     tag = -1 - k if ends else variable * _TAG + k
@@ -405,7 +405,7 @@ def weigh(p: Particles, n_grid: int) -> None:
 
 @compiled
 def write(p: Particles, base: Ints, open_factors: Ints, n_open: int, n_grid: int, total: int, out: Outcomes) -> int:
-    """Writes a row's outcomes from index ``total`` on, ``base`` [O] with the open factors' values; returns their number."""
+    """Writes a row's outcomes, ``base`` [O] plus open factors' values, from index ``total``; returns their number."""
     n_factors = out.states.shape[1]
     weigh(p, n_grid)
     for i in range(n_outcomes(p)):
@@ -455,7 +455,7 @@ def listed(n_rows: int, n_samples: int, n_outputs: int, seed: int, kernel: Calla
 def thin(full: Successors, n_samples: int, seed: int) -> Successors:
     """Reduces rows with more than ``n_samples`` successors to at most ``2 * n_samples``.
 
-    Rare successors are kept as far as there is room, and termination always; see the module's docstring.
+    Rare successors are kept while there is room, termination always; see the module docstring.
 
     Args:
         full: all successors, with exact probabilities.

@@ -27,7 +27,7 @@ class TabularMDP(ExactModel):
     """An MDP with one factor and known outcomes. There is nothing to learn: ``fit`` does nothing, ``state_dict`` is empty.
 
     Args:
-        offsets: where the outcomes of (state, action) begin, int64 [S * A + 1], pair number ``state * A + action``.
+        offsets: where the outcomes of (state, action) begin, int64 [S * A + 1], at index ``state * A + action``.
         next_states: int64 [M].
         terminated: bool [M].
         probabilities: [M], summing to one over each pair.
@@ -325,7 +325,7 @@ class TabularModel(BaseTransitionModel):
 
 @compiled
 def _choose(pair: NDArray[np.int64], offsets: NDArray[np.int64], weights: Floats, u: Floats) -> NDArray[np.int64]:
-    """Sampled table entry of each row, by the inverse of its pair's cumulative sum at ``u``; -1 for unknown pairs."""
+    """Table entry sampled for each row: its pair's inverse cumulative sum at ``u``; -1 for unknown pairs."""
     chosen = np.full(len(pair), -1, dtype=np.int64)
     for b in range(len(pair)):
         if pair[b] < 0:

@@ -1,9 +1,8 @@
 """Fitted value iteration for MDPs too large to solve: values linear in active features and in pairs of them.
 
-States are sampled from simulated play, which is random at first, then greedy with respect to the values fitted so far, except for
-a share of random actions. Backups through the model's successors alternate with kernel ridge regression (Gordon 1995; for sums of
-functions of few factors, Guestrin, Koller, Parr and Venkataraman 2003). The values apply to one reward function and are dropped
-with it.
+States come from simulated play: random at first, then greedy with respect to the values fitted so far, except for a share of
+random actions. Backups through the model's successors alternate with kernel ridge regression (Gordon 1995; for sums of functions
+of few factors, Guestrin, Koller, Parr and Venkataraman 2003). The values apply to one reward function and are dropped with it.
 """
 
 from __future__ import annotations
@@ -95,7 +94,7 @@ def learn_values(task: Task) -> tuple[LeafValues, States]:
 
 
 def _play(task: Task, leaf: LeafValues, number: int) -> States:
-    """States int64 [N, F] visited by play that is greedy on the values, or random if there are none yet."""
+    """States int64 [N, F] visited by play that is greedy for the values, or random if none exist yet."""
     rng = np.random.default_rng([task.seed, number, _PLAY_SALT])
     states, visited = task.start[rng.integers(len(task.start), size=EPISODES)], []
     for step in range(EPISODE_STEPS):

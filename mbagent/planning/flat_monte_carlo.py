@@ -1,4 +1,4 @@
-"""Flat Monte Carlo, the paper's basic search (section 4.1): every action is evaluated by random play after it."""
+"""Flat Monte Carlo, the paper's basic search (section 4.1): each action is evaluated by random play after the action."""
 
 from __future__ import annotations
 
@@ -62,15 +62,15 @@ def forecast_returns(
 ) -> Floats:
     """Discounted return of one random action sequence from each state, with direct forecasts of every step (paper 4.2).
 
-    The state before step k is a sample of the k-step model, given the first k actions; the step itself is a sample of the
-    one-step model. So errors do not accumulate over steps. Samples of different steps do not belong to one trajectory; this
-    leaves the mean of returns unchanged, but not their maximum.
+    The state before step k (from 0) is sampled from the k-step model, given the first k actions; the step itself is sampled from
+    the one-step model. So errors do not accumulate over steps. The samples of different steps do not form one trajectory; this
+    does not change the mean of the returns, but it changes their maximum.
 
     Args:
-        model: models of one and of several steps.
+        model: a one-step model and models of several steps.
         goal: reward of each transition.
         states: int64 [B, F].
-        keys: uint64 [B], keys of the random numbers of sequences and samples.
+        keys: uint64 [B], keys of the random numbers for action sequences and samples.
         horizon: number of steps.
         gamma: discount of a step.
         first_actions: int64 [B].
@@ -92,17 +92,17 @@ def forecast_returns(
 
 
 class FlatMonteCarlo:
-    """Simulates random play after every action and takes the action with the best simulations.
+    """Simulates random play after every action and chooses the action with the best returns.
 
     "Several simulations are rolled out up to a bounded number of steps using the transition sampling method. At the end
     of each simulation the reward is counted, and the action which produced the greatest reward is selected."
-    By default the value of an action is the mean return of its simulations; ``choice="greatest"`` follows the paper's wording,
-    which is risk-seeking in stochastic environments. Outcomes that none of the few simulations of an action samples do not
-    affect its value, so rare but decisive outcomes are missed; the other planners list them.
+    By default the value of an action is the mean return of its simulations; ``choice="greatest"`` takes the greatest return, as
+    the paper says; this is risk-seeking in stochastic environments. Each action has few simulations, and outcomes that they do
+    not sample do not affect its value. So rare but decisive outcomes are missed; the other planners list such outcomes.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
-        """Takes the settings; a model and a goal must follow."""
+        """Stores the settings; set a model and a goal before planning."""
         self.settings = settings
         self._model: TransitionModel | None = None
         self._goal: Reward | None = None
@@ -136,7 +136,7 @@ class FlatMonteCarlo:
         return Plan(best_actions(values), values, np.full(values.shape, float(done)))
 
     def _returns(self, roots: States, done: int) -> Floats:
-        """Discounted returns [R, A, simulations of an action] of one round, after ``done`` simulations of each action."""
+        """Discounted returns of one round, [R, A, simulations per action]; ``done``: earlier simulations of each action."""
         model, goal, settings = self._model, self._goal, self.settings
         assert model is not None
         assert goal is not None  # ``plan`` has checked both
@@ -155,7 +155,7 @@ class FlatMonteCarlo:
         return returns.reshape(len(roots), n_actions, each)
 
     def trace(self, root: States) -> PlanTrace:
-        """Trace of the plan from one root [1, F]; since play is random after one step, its trajectories have one step."""
+        """Trace of the plan from one root [1, F]; its trajectories have only one step, since play is random after that."""
         plan, model, goal = self.plan(root), self._model, self._goal
         assert model is not None
         assert goal is not None  # ``plan`` has checked both
@@ -166,10 +166,10 @@ class FlatMonteCarlo:
 
 
 def direct_model(model: TransitionModel) -> DirectForecastModel:
-    """The model itself, if it has direct forecasts of several steps.
+    """Returns the model if it can forecast several steps directly.
 
     Raises:
-        ValueError: it has none.
+        ValueError: it cannot.
     """
     if not isinstance(model, DirectForecastModel):
         raise ValueError(

@@ -1,6 +1,6 @@
 """Best-first lookahead: the MDP of the most probable states around each root, with more samples near the root.
 
-For models with compiled kernels, the expansion is compiled, too, with the same result.
+For models with compiled kernels, the expansion is compiled, too; the result is the same.
 """
 
 from __future__ import annotations
@@ -39,9 +39,10 @@ def n_draws(layer: int, n_samples: int) -> int:
 
 @compiled
 def _next_batch(graph: GraphArrays, nodes: Ints, n: int, reach: Floats, depth: Ints, budget: int, horizon: int) -> int:
-    """Moves the nodes to expand next to the front of the unexpanded ``nodes`` [n]; returns their number.
+    """Reorders the unexpanded ``nodes`` [n] so that the next batch to expand comes first; returns the size of the batch.
 
-    These are the nodes with almost the highest probability (ABOUT_AS_LIKELY), sorted by probability, then depth, then number.
+    The batch contains nodes with at least ABOUT_AS_LIKELY times the highest probability, within the budget, by decreasing
+    probability, then depth, then index.
     """
     top = 0.0
     for i in range(n):
@@ -93,9 +94,9 @@ def grow_around(
         kernel: the model's arrays.
         work: see ``StateGraph.work_space``.
         out: likewise.
-        graph: nodes from number ``begin`` on, and the root, belong to this root.
+        graph: the state graph; the root and the nodes from index ``begin`` on belong to this root.
         root: its node.
-        begin: number of nodes before the expansion.
+        begin: number of nodes before this root's expansion.
         budget: maximum number of states to expand.
         n_samples: number of samples near the root.
         horizon: maximum number of steps from the root.
@@ -189,18 +190,18 @@ def layer_seed(seed: int, depth: int) -> int:
 
 
 def grow_lookahead(graph: StateGraph, roots: NDArray[np.int64], max_states: int, n_samples: int, horizon: int, seed: int) -> None:
-    """Expands the graph around every root, each in its own group, until the budget of each root is used.
+    """Expands the graph around every root, each root in its own group, until every root's budget is used up.
 
-    The most probable states are expanded first, the nearest first among equally probable ones. So states that the agent's
-    actions reach with certainty come before random ones, and one random event with many outcomes near the root (such as a
-    new maze) does not use the whole budget. The number of samples for each (state, action) decreases from ``n_samples``
-    near the root to one further away, so that the budget suffices for deep states: with shared random numbers, states that
-    differ only by the agent's past actions become equal again.
+    The most probable states are expanded first; among equally probable states, the nearest first. So states that the agent's
+    actions reach with certainty come before states reached by chance, and one random event with many outcomes near the root
+    (such as a new maze) does not use up the budget. The number of samples for each (state, action) decreases from ``n_samples``
+    near the root to one further away, so that the budget suffices for deep states. Since random numbers are shared, states that
+    differ only because of the agent's past actions can become equal again, which saves budget.
 
     Args:
-        graph: contains the roots only, root g in group g.
-        roots: int64 [R], their nodes.
-        max_states: maximum number of states expanded for each root (the root itself always is).
+        graph: contains only the roots; root g is in group g.
+        roots: int64 [R], nodes of the roots.
+        max_states: maximum number of states expanded for each root, including the root, which is always expanded.
         n_samples: number of samples near the root.
         horizon: maximum number of steps from the root.
         seed: of the random numbers.
@@ -229,7 +230,7 @@ def grow_lookahead(graph: StateGraph, roots: NDArray[np.int64], max_states: int,
 def _likeliest(
     graph: StateGraph, reach: NDArray[np.float64], depth: NDArray[np.int64], budget: NDArray[np.int64], horizon: int
 ) -> NDArray[np.int64]:
-    """Nodes to expand next, within the budget: of each group as in ``_next_batch``, in the same order."""
+    """Nodes to expand next, within the budget: in each group those that ``_next_batch`` would select, in the same order."""
     waiting = np.flatnonzero(~graph.expanded & (reach > 0.0) & (depth < horizon))
     groups = graph.groups[waiting]
     top = np.zeros(len(budget))
@@ -244,9 +245,9 @@ def _likeliest(
 def _update_reach(
     graph: StateGraph, start: int, reach: NDArray[np.float64], depth: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Reach and depth of all nodes after the edges from number ``start`` on were added.
+    """Reach and depth of all nodes, updated for the new edges: those from index ``start`` on.
 
-    The reach of a node is the probability of the most probable path from the root, if the agent takes that path's actions.
+    The reach of a node is the probability of its most probable path from the root, given that path's actions.
     """
     alive = ~graph.terminated[start:]
     sources, targets = graph.sources[start:][alive], graph.next_nodes[start:][alive]
@@ -277,7 +278,7 @@ def place_in_group(groups: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _grow_compiled(graph: StateGraph, roots: NDArray[np.int64], max_states: int, n_samples: int, horizon: int, seed: int) -> None:
-    """``grow_lookahead`` for models with compiled kernels: one root after the other."""
+    """``grow_lookahead`` for models with compiled kernels, one root at a time."""
     kernel, (work, out) = graph.kernel, graph.work_space(n_samples)
     assert kernel is not None
     for root in roots:

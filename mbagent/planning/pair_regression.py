@@ -1,4 +1,4 @@
-"""Kernel ridge regression of values on active features and on pairs of them (a polynomial kernel of degree two)."""
+"""Kernel ridge regression of values on active features and pairs of active features (a polynomial kernel of degree two)."""
 
 from __future__ import annotations
 
@@ -29,13 +29,14 @@ MOST_PAIR_FEATURES = 2000
 class PairRegression:
     """Regression of many targets on the same states; features as in LeafValues, none for the commonest value of each factor.
 
-    The kernel of two states that share d features is d + PAIRED d (d - 1) / 2, so each shared pair counts as a further feature.
+    The kernel of two states that share d features is d + PAIRED d (d - 1) / 2: each shared pair acts as a further feature with
+    weight PAIRED.
 
     Args:
-        states: int64 [N, F], states whose values are given, at least one.
+        states: int64 [N, F], states to fit the values on, at least one.
         cardinalities: number of values of each factor, length F.
         valued: int64 [M, F], states whose values are predicted.
-        low, high: bounds of values.
+        low, high: bounds of predicted values.
     """
 
     def __init__(self, states: States, cardinalities: tuple[int, ...], valued: States, low: float, high: float) -> None:
@@ -65,7 +66,7 @@ class PairRegression:
         return column[known], np.searchsorted(rows[known], np.arange(len(states) + 1)).astype(np.int64)
 
     def fit(self, values: Floats) -> LeafValues:
-        """Value function fitted to values [N] of the states."""
+        """Value function fitted to the states' values [N]."""
         mean, x = float(values.mean()), self._x
         dual = cho_solve(self._factor, values - mean)
         pairs = PAIRED * (x.T @ x.multiply(dual[:, None])).toarray() if self._paired else np.zeros((0, 0))

@@ -18,32 +18,35 @@ class PlannerSettings:
 
     Attributes:
         num_simulations: simulations for each decision; ignored with a time budget.
-        time_budget: seconds for each decision instead (for a batch: times the number of observations), or None. At least one
-            batch of simulations runs; further ones follow until the next would exceed the time, or MAX_SEARCHED states are in the
-            graph. The first decision for a new goal takes longer if it generates and solves the reachable MDP; decisions in a
-            solved MDP need no time. Results then depend on the speed of the computer.
-        gamma: discount of a step, above 0 and below 1, so that values are finite in environments without an end.
+        time_budget: seconds for each decision, in place of ``num_simulations`` (multiplied by the number of observations in a
+            batch), or None. At least one batch of simulations runs; further batches follow until the next one would exceed the
+            time or the graph has MAX_SEARCHED states. The first decision for a new goal takes longer if it generates and solves
+            the reachable MDP; decisions in a solved MDP need no search. With a time budget, results depend on the speed of the
+            computer.
+        gamma: discount of a step, above 0 and below 1, so that values are finite even if episodes never end.
         horizon: maximum number of steps that a simulation looks ahead.
         max_states: if at most this many states are reachable, the reachable MDP is solved once for all decisions.
         lookahead_states: states expanded around each root if more than ``max_states`` are reachable.
         n_samples: samples for a (state, action) with too many successors to enumerate, in the reachable MDP.
-        lookahead_samples: the same near a root of a lookahead.
+        lookahead_samples: the same in a lookahead, near its root.
         learn_values: whether leaf values are learned in simulations, once for each goal, if the reachable MDP is too large. They
-            are the values of unexpanded states of the lookahead. If that performs better in simulations, searches do not use
-            them, or use them directly after a first step with ``n_samples`` samples, without a larger lookahead.
+            are the values of the lookahead's unexpanded states. Two alternatives replace this if they do clearly better in
+            simulations: no learned values, or a lookahead that expands only the root, with ``n_samples`` samples, and uses
+            learned values after that step.
         leaf_values: "lookahead" (values of the reachable MDP, or of a lookahead around the root) or "rollouts" (random play).
-        backup: "max" (the value of an action is that of the best policy after it) or "mean" (plain UCT).
-        choice: "mean", or "greatest" as in the paper (flat Monte Carlo only; risk-seeking).
-        forecasts: "iterated" (simulations go step by step) or "direct" (flat Monte Carlo only: each step is forecast from
-            the root by a model of its own, paper 4.2; needs ``model="direct"`` or another DirectForecastModel).
-        c_uct: weight of the search's exploration, in units of the range of values.
+        backup: "max" (the value of an action assumes that the best policy follows) or "mean" (plain UCT).
+        choice: value of an action in flat Monte Carlo: "mean" return, or "greatest" (as in the paper; risk-seeking).
+        forecasts: "iterated" (simulations go step by step) or "direct" (flat Monte Carlo only: the state before each step is
+            forecast from the root by a separate model, paper 4.2; needs ``model="direct"`` or another DirectForecastModel).
+        c_uct: weight of exploration in the search, in units of the range of values.
         batch_size: simulations between two calls of the model.
-        prior_visits: number of visits that an initial value counts as in the search.
-        reuse_tree: whether a decision starts from the search of the last one (MctsPolicy, one observation at a time). That is
-            dropped at episode starts (see ``predict(..., episode_start=...)``), with a new goal or new weights, if it has more
-            than MAX_KEPT states, or too few states that can follow. Results then depend on earlier decisions. The benefit is
-            small: in two learned games returns were unchanged (30 episodes); a decision of 64 simulations took 32% and 18% less
-            time, one of 256 took 20% and 7% more, since reused graphs are larger.
+        prior_visits: number of visits that an initial value counts for in the search.
+        reuse_tree: whether a decision continues the search of the previous decision (MctsPolicy, one observation at a time). The
+            kept search is dropped at episode starts (see ``predict(..., episode_start=...)``), with a new goal or new weights,
+            if it has more than MAX_KEPT states, or if too few of its states are reachable from the new observation. With reuse,
+            results depend on earlier decisions. The benefit is small: in two learned games, returns were unchanged (30
+            episodes); decisions took 32% and 18% less time with 64 simulations, but 20% and 7% more with 256, since reused
+            graphs are larger.
         seed: of the random numbers.
 
     Raises:
@@ -126,7 +129,7 @@ class Plan:
     Attributes:
         actions: int64 [B], the chosen action.
         values: float64 [B, A], estimated discounted return of each action.
-        visits: float64 [B, A], simulations through each action.
+        visits: float64 [B, A], number of simulations that start with each action.
     """
 
     actions: Actions
@@ -137,11 +140,11 @@ class Plan:
 class Planner(Protocol):
     """Chooses actions by simulations with a model; the plan is a pure function of (settings, model, goal, root).
 
-    Planners that can also return the state graph of a plan have the method of ``trajectories.TracingPlanner``.
+    Planners that can also return a plan's state graph implement ``trajectories.TracingPlanner``.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
-        """Takes the settings; a model and a goal must follow."""
+        """Stores the settings; set a model and a goal before planning."""
         ...
 
     def set_model(self, model: TransitionModel, start_states: States) -> None:
@@ -149,16 +152,16 @@ class Planner(Protocol):
         ...
 
     def set_goal(self, goal: Reward) -> None:
-        """Sets a new goal; drops the values of the old one, while state graphs may be kept."""
+        """Sets a new goal; drops the values of the old goal, but may keep state graphs."""
         ...
 
     def plan(self, roots: States) -> Plan:
-        """Plans from each root int64 [B, F]."""
+        """Plans from each of the roots, int64 [B, F]."""
         ...
 
 
 def best_actions(scores: Floats) -> Actions:
-    """The first action [B] whose score [B, A] is the greatest up to rounding errors."""
+    """First action [B] with the greatest score in each row of ``scores`` [B, A], up to rounding errors."""
     top = scores.max(axis=1, keepdims=True)
     slack = 1e-9 * abs(scores).max(axis=1, keepdims=True)
     result: Actions = (scores >= top - slack).argmax(axis=1)

@@ -63,9 +63,9 @@ class Expanded(NamedTuple):
         graph: root r is in group r.
         nodes: int64 [R], the roots.
         solution: values of the graph.
-        visits: [R, A], simulations through the roots' actions.
+        visits: [R, A], number of simulations that start with each root action.
         scores: [R, A], by which actions are chosen.
-        tried: [N, A], simulations through all nodes' actions if the policy is chosen by them; None if by values.
+        tried: [N, A], visit counts of all nodes' actions if they determine the policy; None if the values do.
     """
 
     graph: StateGraph
@@ -80,7 +80,7 @@ class ValueIterationPlanner:
     """Acts greedily on the values of the reachable MDP.
 
     If at most ``max_states`` states are reachable from the start states, this MDP is generated once for the model and solved
-    once for each goal. For each root outside of it, a lookahead is expanded and solved.
+    once for each goal. For each root outside this MDP, a lookahead is expanded and solved.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
@@ -105,7 +105,7 @@ class ValueIterationPlanner:
         self._goal, self._config, self._warned = goal, None, False
 
     def share_config(self, other: ValueIterationPlanner) -> None:
-        """Copies the lookahead configuration of another planner of the same model and goal, if that has chosen one."""
+        """Copies the lookahead configuration of another planner with the same model and goal, if that planner has chosen one."""
         self._config = other._config
 
     def plan(self, roots: States) -> Plan:
@@ -165,7 +165,7 @@ class ValueIterationPlanner:
         return Expanded(graph, nodes, solution, np.zeros_like(scores), scores)
 
     def _empty_graph(self) -> StateGraph:
-        """An empty graph for the next roots, which reuses the memory of the last one."""
+        """An empty graph for the next roots, in the memory of the previous graph."""
         if self._expanded is None:
             self._expanded = StateGraph(self._known_model())
         self._expanded.clear()
@@ -179,7 +179,7 @@ class ValueIterationPlanner:
         return graph, solve(graph, self._known_goal(), settings.gamma, len(roots), config.leaf), nodes
 
     def _chosen_config(self) -> LookaheadConfig:
-        """Lookahead configuration for this goal: that of the settings, or the winner of a race if values are learned."""
+        """Lookahead configuration for this goal: the one in the settings, or the winner of a race if leaf values are learned."""
         if self._config is None:
             settings, start = self.settings, self._start
             default = LookaheadConfig(LOWEST_KNOWN, settings.lookahead_states, settings.lookahead_samples)
@@ -242,9 +242,9 @@ _SEARCH_SALT, _REUSE_SALT = 0x5EA6C4, 0xCA1212
 class MctsPlanner(ValueIterationPlanner):
     """UCT on a state graph.
 
-    With ``leaf_values="lookahead"`` the search starts from the values of a lookahead around the root, each of which counts as
-    ``prior_visits`` visits, and expands promising states further; if the reachable MDP is solved, there is no search.
-    With ``leaf_values="rollouts"`` it starts without values and evaluates leaves by random play, as textbook UCT does.
+    With ``leaf_values="lookahead"`` the search starts from the values of a lookahead around the root and expands promising
+    states further. Each initial value counts for ``prior_visits`` visits. If the root is in a solved MDP, there is no search.
+    With ``leaf_values="rollouts"`` the search starts without values and evaluates leaves by random play, as in textbook UCT.
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
@@ -312,7 +312,7 @@ class MctsPlanner(ValueIterationPlanner):
         return _Search(self, graph, tree, last.decision + 1)
 
     def _expanded_roots(self, roots: States) -> tuple[StateGraph, Values, Ints]:
-        """As ``_lookahead``, but only the roots are expanded, and all values are 0."""
+        """Like ``_lookahead``, but only the roots are expanded, and all values are 0."""
         graph = self._empty_graph()
         nodes = graph.add(roots, np.arange(len(roots), dtype=np.int64))
         graph.expand(nodes, self.settings.n_samples, self.settings.seed)
@@ -322,7 +322,7 @@ class MctsPlanner(ValueIterationPlanner):
 
 
 class _Search:
-    """Searches for a batch of roots, one for each; no edge connects the groups of different roots."""
+    """Runs one search for each root of a batch; no edge connects the groups of different roots."""
 
     def __init__(self, planner: MctsPlanner, graph: StateGraph, tree: SearchTree, decision: int = 0) -> None:
         self.planner, self.graph, self.tree, self.decision = planner, graph, tree, decision
@@ -336,7 +336,7 @@ class _Search:
             measure_spans(graph.arrays, tree)
 
     def run(self, deadline: float | None = None) -> Expanded:
-        """Runs all simulations, or as many as fit before ``deadline``, a value of ``time.perf_counter``."""
+        """Runs all simulations; with ``deadline``, as many as fit before that value of ``time.perf_counter``."""
         if deadline is not None:
             return self._run_until(deadline)
         total = self.settings.num_simulations

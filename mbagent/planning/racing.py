@@ -49,12 +49,12 @@ Act: TypeAlias = Callable[[LookaheadConfig, States], Actions]
 
 
 def best_config(task: Task, configs: Sequence[LookaheadConfig], act: Act) -> LookaheadConfig:
-    """The configuration with the highest return in simulated episodes; without a clear difference the earlier one.
+    """The configuration with the highest return in simulated episodes; if there is no clear difference, the earlier one.
 
     Args:
         task: model, goal, start states, discount and seed.
-        configs: each one after the first must be clearly better than the best before it.
-        act: chooses actions with a configuration.
+        configs: candidates in order; to win, a later one must be clearly better than the best before it.
+        act: function that chooses actions, given a configuration.
     """
     best, *others = (_Trial(task, config, act) for config in configs)
     for other in others:
@@ -64,7 +64,7 @@ def best_config(task: Task, configs: Sequence[LookaheadConfig], act: Act) -> Loo
 
 
 def _plays_better(other: _Trial, best: _Trial) -> bool:
-    """Whether the return of ``other`` is clearly higher than that of ``best``; ends as soon as the result is clear."""
+    """Whether the return of ``other`` is clearly higher than that of ``best``; simulates only until the result is clear."""
     gain, error = 0.0, 0.0
     for n_blocks in range(1, MOST_BLOCKS + 1):
         gains = other.returns(n_blocks) - best.returns(n_blocks)

@@ -29,9 +29,9 @@ class SearchRules(Struct):
     Attributes:
         gamma: discount of a step.
         c_uct: weight of exploration.
-        prior_visits: number of visits that an initial value counts as.
+        prior_visits: number of visits that an initial value counts for.
         rollouts: whether leaves are evaluated by random play.
-        mean: whether backups are means of returns instead of Bellman backups.
+        mean: True to back up means of returns, False for Bellman backups.
         key: of the random numbers, uint64.
     """
 
@@ -49,14 +49,14 @@ class SearchTree(Struct):
     Attributes:
         roots: nodes from which simulations start, int64 [R].
         v: value of each node, [room].
-        q: value of each of its actions, [room, A].
-        visits: simulations through each of them, [room, A].
+        q: value of each action in each node, [room, A].
+        visits: visit count of each action in each node, [room, A].
         counted: number of averaged returns, [room, A].
-        rewards: of each edge, [room].
-        frontier: value of unexpanded nodes without learned values, [G].
-        root_visits: simulations through the roots' actions, [R, A].
+        rewards: reward of each edge, [room].
+        frontier: value of each group's unexpanded nodes if no values are learned, [G].
+        root_visits: number of simulations that start with each root action, [R, A].
         spans: range of the values around each root, [R].
-        extremes: lowest and highest return, [R, 2].
+        extremes: lowest and highest return of each root, [R, 2].
         leaf: learned values of unexpanded nodes.
     """
 
@@ -339,7 +339,7 @@ def _copy_reachable(old: GraphArrays, new: GraphArrays, root: int, nodes: Ints, 
 
 
 def carry_over(old: StateGraph, tree: SearchTree, root: int, new: StateGraph) -> SearchTree:
-    """Copies the part of a search with one root that is reachable from another of its nodes.
+    """Copies the part of a single-root search that is reachable from another node, the new root.
 
     Args:
         old: the graph of that search.

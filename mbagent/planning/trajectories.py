@@ -23,13 +23,13 @@ class PlanTrace:
     """The plan from one root, with the state graph that it is based on.
 
     Attributes:
-        plan: the plan, of one row.
+        plan: the plan, with B = 1.
         graph: the state graph; valid until the planner plans again.
         root: the root's node.
-        rewards: float64 [M], of the graph's successor edges.
-        policy: int64 [N], the action of the best policy found in each node; -1 for nodes without successors.
-        values: float64 [N], of the graph's states; None with flat Monte Carlo.
-        mdp_states: number of states if the reachable MDP was solved, so that there was no search; else 0.
+        rewards: float64 [M], rewards of the graph's successor edges.
+        policy: int64 [N], each node's action under the best policy found; -1 for nodes without a planned action.
+        values: float64 [N], values of the graph's states; None with flat Monte Carlo.
+        mdp_states: number of states of the solved MDP if the plan comes from one, without a search; else 0.
     """
 
     plan: Plan
@@ -46,18 +46,18 @@ class TracingPlanner(Protocol):
     """A planner that can return the trace of a plan."""
 
     def trace(self, root: States) -> PlanTrace:
-        """Trace of the plan from one root int64 [1, F]; its plan is that of ``plan(root)``."""
+        """Trace of the plan from one root int64 [1, F]; its ``plan`` equals ``plan(root)``."""
         ...
 
 
 def best_policy(graph: StateGraph, q: Floats, gamma: float, tried: Floats | None = None) -> Ints:
-    """The action [N] of the best policy in each node, chosen as at the root; -1 for nodes without successors.
+    """Action of the best policy in each node, [N], chosen in the same way as at the root; -1 for unexpanded nodes.
 
     Args:
         graph: the state graph.
         q: float64 [N, A], values.
         gamma: discount.
-        tried: [N, A], simulations, if actions are chosen by them; nodes without any get -1.
+        tried: [N, A], visit counts, if actions are chosen by them; unvisited nodes get -1.
     """
     policy = np.full(len(graph), -1, dtype=np.int64)
     known = np.flatnonzero(graph.expanded if tried is None else tried.sum(axis=1) > 0.0)
@@ -69,9 +69,10 @@ def best_policy(graph: StateGraph, q: Floats, gamma: float, tried: Floats | None
 def likeliest_trajectories(trace: PlanTrace, n_futures: int, n_steps: int) -> list[list[list[int]]]:
     """For every root action, the ``n_futures`` most probable sequences of successor edges, the most probable first.
 
-    After the first action they follow ``trace.policy``. A sequence ends after ``n_steps`` edges, with the episode, or at a
-    node without successors. The list is exact: a best-first search orders partial sequences by their probability times that
-    of their most probable continuation, which is computed by dynamic programming.
+    After the first action, sequences follow ``trace.policy``. A sequence ends after ``n_steps`` edges, at the end of the
+    episode, or at a node without an action in ``trace.policy``. The list is exact: a best-first search orders partial sequences
+    by their probability times the probability of their most probable continuation. The latter is computed by dynamic
+    programming.
     """
     continuations = _continuations(trace, n_steps)
     n_actions = trace.graph.model.n_actions

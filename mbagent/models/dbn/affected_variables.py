@@ -1,9 +1,9 @@
 """Decision graphs in flat arrays, with an index of the variables that a state affects, so that search evaluates only these.
 
 In the all-zero state, each variable has a *usual* distribution for each action; most variables keep their values. In another
-state, a variable's distribution can differ from the usual one only if a feature tested on its usual path differs, or if its own
-value does. Only variables that can differ in this way, or that may change even in the all-zero state, are evaluated. If few
-cells of a board are occupied, these are few, regardless of the size of the board.
+state, a variable's distribution can differ from the usual one only if a feature tested on its usual path, or its own value,
+differs. Only variables that can differ in this way, or that may change even in the all-zero state, are evaluated. If few cells
+of a board are occupied, few variables are, whatever its size.
 Shapes: A actions, U variables, F factors, R values of all factors, W words of 64 variables, M adjacency features, Q mutex groups.
 """
 
@@ -33,7 +33,7 @@ class AffectedIndex(Struct):
         graphs: of all variables, for planning.
         synchronic: of no variable, or only of ``terminated``.
         row: where each factor's values begin among the rows, int64 [F + 1].
-        touched: variables that a factor's value affects, as bits, uint64 [A or 1, R, W].
+        touched: variables that each value affects, as bits, uint64 [A or 1, R, W].
         by_adjacency: variables that each adjacency feature affects, uint64 [A or 1, M, W].
         always: variables that may change even in the all-zero state, uint64 [A, W].
         usual_on: features that are on in the all-zero state without an action, bool [D].
@@ -131,7 +131,7 @@ def _bit(variables: Ints) -> Words:
 
 @inlined
 def show_state(state: Ints, layout: Layout, different: Ints, on: Bools) -> int:
-    """Writes the factors that are not 0 to ``different`` and their features to ``on``; returns how many factors there are."""
+    """Writes the nonzero factors to ``different`` and their features to ``on``; returns the number of these factors."""
     n = 0
     for factor in range(len(state)):
         value = state[factor]
@@ -194,7 +194,7 @@ def only_end_is_synchronic(layout: Layout, synchronic: Graphs) -> bool:
 
 @compiled
 def end_rate(action: int, following: Ints, on: Bools, layout: Layout, synchronic: Graphs) -> float:
-    """Probability that the episode ends with this next state [F]; ``on`` are the features of the current state, [D].
+    """Probability that the episode ends in this next state [F]; ``on`` holds the current state's features, [D].
 
     Features of the next state are evaluated only when the graph tests them.
     """

@@ -32,7 +32,7 @@ class Graphs(Struct):
 
     Attributes:
         changing: variables that have graphs, int64.
-        pairs: where each variable's pairs (action class, value) begin, int64 [U + 1]; the number of a pair within a variable is
+        pairs: where each variable's pairs (action class, value) begin, int64 [U + 1]; the index of a pair within a variable is
             ``action_class * cardinality + value``, see ``features.ActionEncoding``.
         entries: where the entries of each pair begin, int64 [pairs + 1].
         entry: the value whose probability an entry predicts, and its first node, int64 [E, 2].
@@ -68,7 +68,7 @@ class Nodes:
         self.rates: list[tuple[float, float]] = []
 
     def add(self, feature: int, off: int, on: int, rate: float = 0.0, spread: float = 0.0) -> int:
-        """Adds a node; returns its number."""
+        """Adds a node; returns its index."""
         self.links.append((feature, off, on))
         self.rates.append((rate, spread))
         return len(self.links) - 1
@@ -233,7 +233,7 @@ def show_next_adjacencies(following: Ints, layout: Layout, on: Bools) -> None:
 
 @inlined
 def without_noise(rate: float, spread: float, n: int, noise: float) -> float:
-    """A leaf's rate for planning, of one of ``n`` values; negative if it counts only unless it is negligible.
+    """A leaf's rate for one of ``n`` values, for planning; negative if it is to be ignored when negligible.
 
     If all rows of a leaf agree (``spread`` 0), its outcome is taken as certain. For bits this is decided here; for variables of
     more values, in ``with_rest``, when the rates of all values are known.
@@ -284,7 +284,7 @@ def has_graphs(graphs: Graphs, pair: int) -> bool:
 def distributions(
     variables: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs, on: Bools, values: Ints, out: Floats
 ) -> None:
-    """Writes value and next distribution of some variables to ``values`` [U] and, from ``start[variable]`` on, to ``out``."""
+    """Writes some variables' values to ``values`` [U], their next distributions to ``out`` from ``start[variable]`` on."""
     noise, action_class = graphs.noise[0], layout.encoding.action_class[action]
     for variable in variables:
         n, start, value = layout.outputs[variable], graphs.start[variable], read(state, variable, layout)

@@ -85,7 +85,7 @@ def last_changes(rows: TransitionBatch, n_variables: int, log_predictive: LogPre
 
 
 class _Run(NamedTuple):
-    """A run of newest steps that may follow new rules.
+    """The newest steps, which may follow new rules.
 
     Attributes:
         length: number of its steps L.
@@ -130,7 +130,7 @@ def _cross_validated(rows: TransitionBatch, newest: Ints, log_predictive: LogPre
 
 
 def _change_points(gain: Floats, limit: float) -> Ints:
-    """First row from which the summed gains [N, V] are greatest: common to all, or a variable's own if it is much better."""
+    """Row from which the summed gains [N, V] are greatest: one for all, or a variable's own if that is much better."""
     later = np.cumsum(gain[::-1], axis=0)[::-1]
     own, common = later.argmax(axis=0), later.sum(axis=1).argmax()
     result: Ints = np.where(later.max(axis=0) - later[common] > 3.0 * limit, own, common)

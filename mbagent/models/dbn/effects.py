@@ -1,6 +1,6 @@
 """Effect parametrisations of ordinal variables: the next value, its change, or its deviation from a sum.
 
-Held-out transitions decide which one is used. The second operand of a sum is the action's number, an action component, or another
+Held-out transitions decide which one is used. The second operand of a sum is the action's index, an action component, or another
 factor's value, as in stock plus order minus demand. For saturating sums such as inventory levels, the distribution of the
 residual is shared by all (stock, order) pairs; at a bound, only the unclipped sum is relevant. Back-off statistics of a variable
 given its value and the action (persistence, and the probability of a value never observed) smooth the result.
@@ -44,7 +44,7 @@ class Pools:
     """Pairs whose rows are counted together for the unseen mass.
 
     Attributes:
-        of: number of each pair's pool, int64 [pairs].
+        of: index of each pair's pool, int64 [pairs].
         positives: outcome of each row, numbered consistently within a pool, int64 [N].
     """
 
@@ -115,9 +115,9 @@ class Operand:
 
     Attributes:
         cardinality: number of its values.
-        factor: number of the factor, or -1.
+        factor: index of the factor, or -1.
         stride: of an action component: its value is ``action // stride % cardinality``.
-        feature: number of the component's first feature among those of actions.
+        feature: index of the component's first feature among those of actions.
         whole: whether it is the action itself, which has no components.
     """
 
@@ -133,7 +133,7 @@ class Operand:
         return np.asarray(found, dtype=np.int64)
 
     def features(self, layout: Layout) -> Ints:
-        """Number of the feature of each of its values, int64 [cardinality]."""
+        """Index of each value's feature, int64 [cardinality]."""
         if self.factor >= 0:
             own = (layout.factor == self.factor) & (layout.value == layout.top)
             return np.flatnonzero(own)[np.argsort(layout.value[own])]
@@ -153,7 +153,7 @@ def likely_operands(factors: Sequence[int], among: Sequence[Operand], rows: Tran
     The slopes are those of a least-squares regression on all candidates together; significance is by t statistics.
 
     Args:
-        factors: numbers of factors that are among the candidates themselves.
+        factors: indices of the factors, themselves among the candidates.
         among: the candidate operands.
         rows: N transitions.
     """
@@ -190,7 +190,7 @@ def chained(entries: Ints, features: Ints, add: Callable[[int, int, int], int], 
     Args:
         entries: (operand's value, current value, next value, node), int64 [N, 4].
         features: those of the operand's values.
-        add: adds a node (feature, off, on) and returns its number.
+        add: adds a node (feature, off, on) and returns its index.
         zero: node for values of the operand without an entry.
 
     Returns:
@@ -203,7 +203,7 @@ def chained(entries: Ints, features: Ints, add: Callable[[int, int, int], int], 
 
 
 def for_all_actions(smoothing: Smoothing, n_operand: int, n_action_classes: int) -> Smoothing:
-    """Smoothing by (operand's value, value) pairs converted to (action class, value) pairs."""
+    """Converts smoothing of (operand's value, value) pairs to (action class, value) pairs."""
     persistence, unseen_mass = (
         np.tile(array.reshape(n_operand, -1).max(axis=0), n_action_classes)
         for array in (smoothing.persistence, smoothing.unseen_mass)
@@ -235,7 +235,7 @@ class Effect(Enum):
 
 
 class EffectModel(NamedTuple):
-    """An effect with the operand of its sum; None for the number of the action class."""
+    """An effect with the operand of its sum; None for the action class's index."""
 
     effect: Effect
     operand: Operand | None = None
@@ -291,7 +291,7 @@ def _sum_effect(effects: tuple[Effect, Effect], operand: Operand, sign: int) -> 
 
 
 def more_folds(train: TransitionBatch, held_out: TransitionBatch) -> list[Bools]:
-    """Rows of further folds to hold out if the held-out rows are too few to choose an effect, bool [folds][N]."""
+    """Further folds to hold out if there are too few held-out rows to choose an effect, bool [folds][N]."""
     if (n := len(train) // MOST_EFFECT_FOLDS) == 0:
         return []
     folds = min(MOST_EFFECT_FOLDS - 1, -(-(ENOUGH_HELD_OUT - len(held_out)) // n))
@@ -303,7 +303,7 @@ def questions_for_effect(effect: Effect, variable: int, cardinality: int, n_acti
 
     Args:
         effect: the effect; variables of two values always have absolute effects.
-        variable: its number.
+        variable: its index.
         cardinality: number of its values.
         n_actions: number of action classes (or values of the operand), observed or not.
         observed: its transitions.
@@ -356,13 +356,13 @@ def _sum_questions(effect: Effect, variable: int, cardinality: int, n_actions: i
 
 
 def _without_current_value(one: Question, cardinality: int) -> Question:
-    """The question without pairs whose current value it predicts: that value gets the remaining probability."""
+    """The question without pairs that predict their current value, which gets the remaining probability."""
     other = one.pairs % cardinality != one.values
     return replace(one, values=one.values[other], pairs=one.pairs[other], context=one.context[other])
 
 
 def smoothing_for_effect(effect: Effect, cardinality: int, n_actions: int, observed: Observed) -> Smoothing:
-    """Smoothing of a variable under an effect: rows that the effect pools are counted together here, too."""
+    """Smoothing of a variable under an effect; rows that the effect pools are counted together."""
     if effect is Effect.ABSOLUTE or cardinality == 2 or len(observed.now) == 0:
         return smoothing_of(cardinality, n_actions, observed.actions, observed.now, observed.then)
     every = np.arange(n_actions * cardinality)

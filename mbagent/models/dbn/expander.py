@@ -1,8 +1,8 @@
 """Decision graphs in compiled search: only the variables that a state affects are evaluated (see ``affected_variables.py``).
 
-The outcomes are those of ``successors.successors``, at a cost that grows with the number of affected variables and not with that
-of all variables. The only variable with synchronic arcs is the end of the episode; features of the next state are evaluated only
-when its graph tests them.
+The outcomes are those of ``successors.successors``, at a cost that grows with the number of affected variables, not of all. The
+only variable with synchronic arcs is the end of the episode; features of the next state are evaluated only when its graph tests
+them.
 Shapes: A actions, U variables, F factors, Q mutex groups, W words of 64 variables, D features.
 """
 
@@ -192,7 +192,7 @@ def _settle(g: AffectedIndex, touched: Ints, work: GraphWork, grid: Grid) -> tup
 
 @compiled
 def _write(g: AffectedIndex, work: GraphWork, total: int, n_open: int, ended: bool, n_grid: int, out: Outcomes) -> int:
-    """Writes the outcomes that the particles represent, from number ``total`` on; returns their number."""
+    """Writes the outcomes that the particles represent, from index ``total`` on; returns their number."""
     p = work.p
     weigh(p, n_grid)
     for i in range(n_outcomes(p)):

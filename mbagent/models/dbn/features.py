@@ -1,9 +1,9 @@
-"""Variables, their features, and the one-vs-rest targets that decision graphs are learned for.
+"""Variables, their features, and the one-vs-rest targets of decision graphs.
 
-A *variable* is a factor, or a group of bits of which exactly one is on; ``terminated`` is one more, and so is whether a rare
-reset happens. A *feature* is on or off: a bit, one value of a factor with more than two, whether a factor has at least some
-value, or an action. Joint actions of several components (``MultiBinary`` or ``MultiDiscrete`` spaces) are very many, and each is
-taken only a few times; with features for the components, all actions that agree in the relevant components share parameters.
+A *variable* is a factor, a group of bits of which exactly one is on, ``terminated``, or whether a rare reset happens. A
+*feature* is on or off: a bit, one value of a factor with more than two, a factor's reaching a threshold, or an action. There are
+very many joint actions of several components (``MultiBinary`` or ``MultiDiscrete`` spaces), each taken only a few times; with
+component features, actions that agree in the relevant components share parameters.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ActionEncoding(Struct):
 
     Attributes:
         first: where each action's features begin in ``feature``, int64 [A + 1].
-        feature: numbers of the features that are on, ascending, int64.
+        feature: indices of the features that are on, ascending, int64.
         n_features: number of features K.
         action_class: class in which each action is counted, int64 [A]: one of its own if actions have no components; 0 for all
             actions with components, so that only features distinguish them.
@@ -100,7 +100,7 @@ class Layout(Struct):
         exactly: whether exactly one is on, bool [Q].
         mutex_of: mutex group of each variable, or -1, int64 [U].
         counts, observed: invariants of planes, see ``planes/invariants.py``.
-        weights: weight of each channel's value in the number of a combination of values, int64 [C].
+        weights: weight of each channel's value in the index of a combination of values, int64 [C].
     """
 
     outputs: Ints
@@ -267,7 +267,7 @@ class Question:
         pairs: action class * cardinality + current value, for each pair, int64 [P], ascending.
         target: the rows.
         context: initial context of each pair, int64 [P]: one of its own, unless several pairs share a context.
-        operand: features of the operand that replaces the action in the pairs, one per operand value, int64; None if none does.
+        operand: features of the operand that replaces the action in the pairs, one per operand value, int64; or None.
     """
 
     variable: int
@@ -283,7 +283,7 @@ class Observed:
     """Transitions of one variable, with the patterns of their features.
 
     Attributes:
-        pattern: number of each row's pattern, including the action, int64 [N]; rows of one pattern have one current value.
+        pattern: index of each row's pattern, including the action, int64 [N]; rows of a pattern share their current value.
         actions: action classes, see ``ActionEncoding``, int64 [N].
         now: the variable's current values, int64 [N].
         then: its next values, int64 [N].
@@ -338,7 +338,7 @@ def question(
         cardinality: number of the variable's values.
         observed: the R rows.
         every: pairs to predict for, int64 [P], ascending; None for the observed ones.
-        alike: number of the initial context of each pair, int64 [P]; None for one context each.
+        alike: index of the initial context of each pair, int64 [P]; None for one context each.
     """
     n, e = np.bincount(observed.pattern), np.bincount(observed.pattern, weights=positives == value).astype(np.int64)
     pair_of = np.empty(len(n), dtype=np.int64)
@@ -363,7 +363,7 @@ ENTRIES_AT_ONCE = 20_000_000
 
 
 def distinct(table: NDArray[Any], also: Ints | None = None) -> tuple[Ints, Ints]:
-    """Number of the first row of each pattern [P], and the pattern of each row, int64 [N].
+    """Index of the first row of each pattern [P], and the pattern of each row, int64 [N].
 
     Args:
         table: integers or booleans [N, D].

@@ -47,8 +47,8 @@ USUAL = 0.95
 def flag_resets(states: Factors, next_states: Factors) -> Bools:
     """Which transitions are candidates for resets, bool [N].
 
-    These are the transitions that change factors which never change in the usual ones: transitions that change at most twice as
-    many factors as the quantile ``USUAL``.
+    They change factors that never change in usual transitions, which change at most twice as many factors as the quantile
+    ``USUAL``.
 
     Args:
         states: int [N, F].
@@ -67,7 +67,7 @@ class Resets(NamedTuple):
 
     Attributes:
         rows: which transitions these are, bool [N].
-        redrawn: the factors, and last ``terminated``, that have graphs of their own in them, bool [F + 1]; others have the usual
+        redrawn: which factors, and last ``terminated``, have their own graphs in these rows, bool [F + 1]; others keep the usual
             ones.
         jointly: whether to search for synchronic arcs between the redrawn variables.
     """
@@ -128,7 +128,7 @@ def probabilities(layout: Layout, graphs: Graphs, rows: TransitionBatch) -> Floa
 
 
 def go_together(error: Floats, other: Floats, spread: Floats, other_spread: Floats, n_tried: int) -> bool:
-    """Whether two features' errors [...] are correlated, given their variances [...], in one of ``n_tried`` tests."""
+    """Whether two features' errors [...] with variances [...] are correlated, as one of ``n_tried`` tests."""
     one, two, three, four = (part.reshape(-1, 1) for part in (error, other, spread, other_spread))
     return bool(_correlated(one, two, three, four, n_tried)[0, 0])
 
@@ -177,7 +177,7 @@ def find_dependent(layout: Layout, graphs: Graphs, rows: TransitionBatch, usual:
         layout: the variables, with their mutex groups.
         graphs: without synchronic arcs.
         rows: N transitions.
-        usual: numbers of those that are no resets, int64 [R].
+        usual: indices of the non-reset rows, int64 [R].
     """
     n_features, last, owner = len(layout.factor), len(layout.outputs) - 2, feature_owners(layout)
     most = max(1000, MOST_ERRORS // max(n_features, 1))
@@ -284,7 +284,7 @@ class _Table:
         return self.questions(variable, self.observed(variable).select(self.counting(variable, which)))
 
     def counting(self, variable: int, which: Ints) -> Ints:
-        """The rows, of some, that count for a variable."""
+        """Those of some rows that count for a variable."""
         result: Ints = which[which >= self.since[variable]]
         return result
 
@@ -429,7 +429,7 @@ def _reset_graphs(
 def _synchronic_graphs(
     table: _Table, layout: Layout, graphs: Graphs, usual: Ints, dependent: Sequence[Asked], in_pairs: bool
 ) -> Part:
-    """Graphs of those variables, of the given ones, that depend on other variables' next values in some rows."""
+    """Graphs of those given variables that depend on other variables' next values in some rows."""
     rows, kinds, n_features = table.rows, table.kinds(usual), table.features.shape[1]
     all_questions: list[Question] = []
     all_found: list[Search] = []
@@ -478,7 +478,7 @@ def _cardinalities(layout: Layout) -> NDArray[np.int64]:
 
 
 def indicator_rates(layout: Layout, rows: TransitionBatch, flags: Bools) -> Floats:
-    """Probability that a transition is flagged, given state and action, from a decision graph fitted to the flags [N], [N]."""
+    """Probability [N] that a transition is flagged given state and action, from a decision graph fitted to flags [N]."""
     table, every, last = _Table(layout, rows, flags, NO_EFFECTS, None), np.arange(len(rows)), len(layout.outputs) - 1
     graphs = _graphs(table, {last: every}, every, True, False).graphs
     rates: Floats = sampling.reset_rates(rows.states, rows.actions, sampling.work_space(layout, graphs, graphs))
@@ -488,8 +488,8 @@ def indicator_rates(layout: Layout, rows: TransitionBatch, flags: Bools) -> Floa
 def _graphs(table: _Table, rows_of: Mapping[int, Ints], observed: Ints, regular: bool, in_pairs: bool) -> Part:
     """The graphs of some variables, each fitted to the given rows; ``observed`` are the rows of this regime.
 
-    The probability that a variable which never changed does change is estimated from all variables together in a ``regular``
-    regime, else for each by itself.
+    The probability of change of variables that never changed is estimated jointly in a ``regular`` regime, else for each
+    separately.
     """
     questions = [question for variable, which in rows_of.items() for question in table.ask(variable, which)]
     found = find_splits(

@@ -1,7 +1,7 @@
 """Joint events: values of several variables that occur together more often than the graphs predict.
 
-A crash may set several variables at once, each of which often takes such a value by itself. No pair of them then differs much
-from independent variables, but all together do: three bits that are each on with 12% are all on in 0.2% of steps, and an event of
+A crash may set several variables at once, each of which often takes such a value by itself. No pair of them then looks far from
+independent, but all together do: three bits, each on in 12% of steps, would all be on in 0.2%, and an event with probability
 0.7% multiplies that by five. Patterns are grown from pairs by the log-likelihood ratio of Poisson counts, as in the search for
 frequent item sets (Agrawal and Srikant 1994; DuMouchel 1999). The model then has a mixture: in an event, the variables of the
 patterns have graphs of their own (see ``fitting.Resets``).
@@ -76,10 +76,10 @@ class Pattern(NamedTuple):
 
     Attributes:
         items: the items.
-        action: the action class after which they do, or -1 for all.
+        action: the action class they follow, or -1 for all.
         observed: number of rows.
         expected: number of rows that the graphs predict.
-        scale: the same, divided by what it would be if the items were independent given the state and action.
+        scale: ``expected`` divided by its value if the items were independent given state and action.
         chance: if not NaN, the probability that such a row is an event; else it follows from the rate of the pattern.
     """
 
@@ -219,7 +219,7 @@ class _Search:
     Args:
         fitted: graphs without events.
         rows: N transitions.
-        table: the same as values.
+        table: the rows as values.
         items: the items that are searched.
         action: its class, or -1 for all.
         tests: logarithm of the number of searches.
@@ -237,7 +237,7 @@ class _Search:
         self._drawn: Table | None = None
 
     def leave_out(self, patterns: Sequence[Pattern]) -> None:
-        """Transitions with these patterns count for no further ones."""
+        """Excludes transitions with these patterns from the search."""
         for pattern in patterns:
             self.free &= ~self.table.occurs(pattern.items).all(axis=1)
 
@@ -268,7 +268,7 @@ class _Search:
         return found
 
     def ends(self) -> list[Pattern]:
-        """Patterns of the transitions that end an episode, more of which are observed than expected."""
+        """Patterns of transitions that end an episode, observed more often than expected."""
         left, end = self.rows.terminated & self.free, len(self.fitted.layout.outputs) - 2
         over = Items(np.array([end]), np.array([VALUE]), np.array([1]))
         found: list[Pattern] = []
@@ -288,9 +288,9 @@ class _Search:
         return found
 
     def _extended(self, members: list[int], rows: Ints) -> tuple[list[int], float]:
-        """A set of items, present in some rows, after adding the most surprising further items; with its evidence.
+        """A set of items present in the rows, extended by the most surprising others; and its evidence.
 
-        Without items at the beginning, it is that of the items given these rows; else that of the items in all rows.
+        If the set is initially empty, the evidence is that given these rows; else that in all rows.
         """
         items, end, given = self.items, len(self.fitted.layout.outputs) - 2, not members
         best, highest, total = list(members), -math.inf if members else 1.0, 0.0
@@ -347,7 +347,7 @@ def _seen(fitted: Fitted, after: Factors, terminated: Bools) -> Ints:
 
 
 def excess(fitted: Fitted, rows: TransitionBatch, patterns: Sequence[Pattern]) -> Floats:
-    """First estimate of the probability that a transition is an event, [N]: by how much its pattern exceeds the prediction."""
+    """Initial probability that a transition is an event, [N], from its pattern's excess over the prediction."""
     classes, result = fitted.layout.encoding.action_class[rows.actions], np.zeros(len(rows))
     has, predicted = np.zeros((len(patterns), len(rows)), dtype=np.bool_), np.zeros((len(patterns), len(rows)))
     begin = 0
@@ -388,14 +388,14 @@ def event_chances(fitted: Fitted, rows: TransitionBatch, patterns: Sequence[Patt
 
 
 def settled(chances: Floats) -> Bools:
-    """Evenly spaced rows, as many as the sum of the probabilities [N], each about as often as its own."""
+    """Selects rows evenly in proportion to their probabilities [N], as many as these sum to."""
     total = np.floor(np.cumsum(chances) + 0.5)
     result: Bools = np.diff(np.concatenate([[0.0], total])) > 0.0
     return result
 
 
 def factors_of(fitted: Fitted, patterns: Sequence[Pattern]) -> Bools:
-    """Which factors, and whether ``terminated``, the patterns contain, bool [F + 1]."""
+    """Which factors, and last ``terminated``, occur in the patterns, bool [F + 1]."""
     layout, result = fitted.layout, np.zeros(fitted.layout.n_factors + 1, dtype=np.bool_)
     for variable in np.unique(np.concatenate([p.items.variable for p in patterns])):
         result[layout.members[layout.first[variable] : layout.first[variable + 1]]] = True

@@ -1,4 +1,4 @@
-"""Spike-and-slab priors of the rates in leaves (Mitchell and Beauchamp 1988), estimated from all leaves (empirical Bayes)."""
+"""Spike-and-slab priors for leaf rates (Mitchell and Beauchamp 1988), estimated from all leaves (empirical Bayes)."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ WORTHWHILE = 40.0
 
 @dataclass(frozen=True)
 class LeafPrior:
-    """Prior of a leaf's rate: a spike at 0 and 1, and a Beta distribution around the prior mean (the slab).
+    """Prior of a leaf's rate: point masses at 0 and 1 (the spike), and a Beta distribution around the prior mean (the slab).
 
     Attributes:
-        certain: probability that the leaf is deterministic.
-        strength: rows that the prior mean counts for otherwise.
+        certain: prior probability that the leaf is deterministic (the spike).
+        strength: number of rows that the prior mean counts for in the slab.
     """
 
     certain: float
     strength: float
 
     def evidence(self, n: Ints, e: Ints, prior_mean: Floats) -> tuple[Floats, Floats]:
-        """Log-probability of ``e`` positives in ``n`` rows, in their order, and the posterior probability of the slab."""
+        """Log-probability of a sequence of ``n`` rows with ``e`` positives, and the posterior probability of the slab."""
         return _with_spike(self._slab(n, e, prior_mean)[0], self.certain, n, e, prior_mean)
 
     def rates(self, n: Ints, e: Ints, prior_mean: Floats) -> Floats:
@@ -65,20 +65,20 @@ class LeafPrior:
         return result
 
     def _slab(self, n: Ints, e: Ints, prior_mean: Floats) -> tuple[Floats, Floats]:
-        """Log-probability of the rows under the slab, and their posterior mean rate."""
+        """Log-probability of the rows, and posterior mean rate, both under the slab."""
         up, down = self.strength * prior_mean, self.strength * (1.0 - prior_mean)
         return special.betaln(up + e, down + n - e) - special.betaln(up, down), (e + up) / (n + self.strength)
 
 
 @dataclass(frozen=True)
 class MixedPrior(LeafPrior):
-    """A prior whose slab is the distribution of the rates of all leaves, since many environments have only few different rates.
+    """A prior whose slab is fitted to the rates of all leaves, since many environments have only a few distinct rates.
 
     The slab is the maximum-likelihood mixture of narrow Beta distributions (after Kiefer and Wolfowitz 1956, and Laird 1978); in
-    addition, the prior mean counts for ``strength`` rows. With equal weights it is about the simple prior.
+    addition, the prior mean counts for ``strength`` rows. With equal weights, it is close to a simple prior.
 
     Attributes:
-        weights: of the components, see CENTRES.
+        weights: weight of each component, [K]; see CENTRES.
     """
 
     weights: Floats
@@ -93,12 +93,12 @@ class MixedPrior(LeafPrior):
 
 
 def best_prior(searches: Sequence[Search]) -> LeafPrior:
-    """The simple prior with the highest evidence of the leaves."""
+    """The prior in ``PRIORS`` under which the leaves have the highest evidence."""
     return _best_of(PRIORS, *_leaves(searches))
 
 
 def fitted_prior(searches: Sequence[Search]) -> LeafPrior:
-    """As ``best_prior``, or a mixture fitted to the leaves if its evidence is clearly higher."""
+    """A mixture fitted to the leaves if its evidence is clearly higher; otherwise the result of ``best_prior``."""
     n, e, prior_mean = _leaves(searches)
     simple, observed = _best_of(PRIORS, n, e, prior_mean), np.flatnonzero(n)
     if len(observed) == 0:
@@ -111,7 +111,7 @@ def fitted_prior(searches: Sequence[Search]) -> LeafPrior:
 
 
 def _leaves(searches: Sequence[Search]) -> tuple[Ints, Ints, Floats]:
-    """Rows, positives and prior mean of all leaves."""
+    """Counts of rows and positives, and prior mean, of each leaf."""
     counts = [search.counts() for search in searches]
     nothing = np.zeros(0, dtype=np.int64)
     n, e = (np.concatenate([nothing, *(pair[i] for pair in counts)]) for i in (0, 1))
@@ -123,7 +123,7 @@ def _best_of(priors: Sequence[LeafPrior], n: Ints, e: Ints, prior_mean: Floats) 
 
 
 def _with_spike(slab: Floats, certain: float, n: Ints, e: Ints, prior_mean: Floats) -> tuple[Floats, Floats]:
-    """Evidence of leaves with spike and slab, given the evidence under the slab alone, and the slab's posterior probability."""
+    """Evidence of each leaf, and the slab's posterior probability; ``slab`` is the evidence under the slab alone."""
     slab = slab + np.log1p(-certain)
     with np.errstate(divide="ignore"):
         spike = np.log(certain * ((e == 0) * (1.0 - prior_mean) + (e == n) * prior_mean))
@@ -132,14 +132,14 @@ def _with_spike(slab: Floats, certain: float, n: Ints, e: Ints, prior_mean: Floa
 
 
 def _likelihoods(n: Ints, e: Ints, prior_mean: Floats, strength: float) -> Floats:
-    """Log-probability [N, K] of the leaves' rows, with those that the prior mean counts for, under each component."""
+    """Log-probability [N, K] of each leaf's rows, plus the pseudo-counts of the prior mean, under each component."""
     up, down = e + strength * prior_mean, n - e + strength * (1.0 - prior_mean)
     result: Floats = special.betaln(UP + up[:, None], DOWN + down[:, None]) - special.betaln(UP, DOWN)
     return result
 
 
 def _mixture(certain: float, n: Ints, e: Ints, prior_mean: Floats) -> MixedPrior:
-    """The maximum-likelihood mixture, by expectation and maximisation from equal weights and ``certain`` of a simple prior."""
+    """The maximum-likelihood mixture, by EM, starting from equal weights and from the ``certain`` of a simple prior."""
     rows, before = (_likelihoods(k * n, k * e, prior_mean, MIXED_STRENGTH) for k in (1, 0))
     top = rows.max(axis=1)
     rows, before, weights = np.exp(rows - top[:, None]), np.exp(before), np.full(len(CENTRES), 1.0 / len(CENTRES))

@@ -66,12 +66,12 @@ def depends_on_action(graphs: Graphs, variable: int, layout: Layout) -> bool:
 
 
 def parent_factors(layout: Layout, features: set[int]) -> set[int]:
-    """Factors of state features; features of the next state are left out."""
+    """Factors that the given features test in the current state; other features are ignored."""
     return {int(layout.factor[feature]) for feature in features if feature < len(layout.factor)}
 
 
 def flat_variables(layout: Layout, graphs: Graphs, synchronic: Graphs) -> list[Variable]:
-    """Factors and groups that have graphs, and their parents other than themselves."""
+    """Factors and mutex groups that have graphs, each with its parents except itself."""
     n, after, found = len(layout.factor), len(layout.factor) + layout.encoding.n_features, []
     for variable in graphs.changing[graphs.changing < len(layout.outputs) - 2]:
         factors = tuple(int(f) for f in layout.members[layout.first[variable] : layout.first[variable + 1]])
@@ -110,23 +110,23 @@ WORTH_TELLING = 0.03
 
 
 class DecisionGraphModel(GraphPredictions):
-    """A transition model that predicts each variable's next value by small decision graphs over the few features it depends on.
+    """A transition model in which small decision graphs over a few relevant features predict each variable's next value.
 
-    Bits of which exactly one is on are drawn as one variable. Resets, rare transitions that redraw almost everything, have graphs
-    of their own and one for whether they happen. Probabilities are exact, except that ``log_prob`` and ``marginals`` give
-    variables that never changed a tiny probability of changing, which samples ignore. A fit takes a few seconds, and longer with
-    very many values.
+    A group of bits of which exactly one is always on is drawn as one variable. Resets (rare transitions that redraw almost
+    everything) have their own graphs, and one more graph predicts whether a reset happens. Probabilities are exact, with one
+    exception: if a variable never changed, ``log_prob`` and ``marginals`` give it a tiny probability of changing, and samples
+    ignore this probability. A fit takes a few seconds, or longer if the data contain very many factor values.
 
     Args:
         cardinalities: number of values of each state factor, length F.
         n_actions: number of enumerated actions A.
         validation: share of episodes held out, for the report and for choices between variants of the model; the final graphs
             are fitted to all rows.
-        parts: number of values of each action component, such as (2, 2, 2) for three switches, numbered as by
-            ``ActionEnumeration``; each component then has features of its own. None: actions have no components.
+        parts: number of values of each action component, such as (2, 2, 2) for three switches; each component then has its own
+            features, and joint actions are numbered as by ``ActionEnumeration``. None: actions have no components.
 
     Raises:
-        ValueError: the numbers of values in ``parts`` do not multiply to ``n_actions``.
+        ValueError: the product of ``parts`` is not ``n_actions``.
     """
 
     def __init__(
@@ -193,7 +193,7 @@ class DecisionGraphModel(GraphPredictions):
         resets: Bools,
         held_out: TransitionBatch,
     ) -> bool:
-        """Fits the training rows with joint events, unless they predict clearly worse; returns whether they are kept."""
+        """Fits the training rows with joint events; keeps the fit, and returns True, unless it predicts clearly worse."""
         candidate = fit(train, self._redrawn(resets, settled(excess(plain, train, patterns)) & ~resets, patterns))
         if better(self._logs(plain, held_out), self._logs(candidate, held_out)):
             return False
@@ -201,7 +201,7 @@ class DecisionGraphModel(GraphPredictions):
         return True
 
     def _redrawn(self, resets: Bools, events: Bools, patterns: Sequence[Pattern]) -> Resets:
-        """Resets and joint events together: if there are resets, everything is redrawn."""
+        """Combines resets and joint events; if there are any resets, all factors and ``terminated`` are redrawn."""
         own = factors_of(self.fitted, patterns) | resets.any()
         return Resets(resets | events, own, jointly=len(patterns) > 1 or bool(resets.any()))
 
@@ -229,7 +229,7 @@ class DecisionGraphModel(GraphPredictions):
     def _split(
         self, data: TransitionDataset, seed: int, since: NDArray[np.int64]
     ) -> tuple[TransitionBatch, TransitionBatch, NDArray[np.int64]]:
-        """Training and held-out rows, and ``since`` as numbers of training rows; only rows after all changes are held out."""
+        """Training rows, held-out rows, and ``since`` as training-row indices; only rows after the last change are held out."""
         rows, mask = data.rows(), data.held_out(self.validation, seed)
         if not since.any():
             return (*data.split(self.validation, seed), since)
@@ -240,7 +240,7 @@ class DecisionGraphModel(GraphPredictions):
         return rows.select(~mask), rows.select(mask), np.searchsorted(np.flatnonzero(~mask), since)
 
     def _factor_log_probs(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
-        """Log-probability of each factor's next value and of termination, [T, F + 1], after a quick fit to other transitions."""
+        """Log-probabilities [T, F + 1] of the next factors and ``terminated`` in ``tests``, after a quick fit to ``train``."""
         before = self._snapshot()
         self._fit_quickly(train)
         probs, start = self.marginals(tests.states, tests.actions), np.concatenate([[0], np.cumsum(self.cardinalities)])
@@ -254,7 +254,7 @@ class DecisionGraphModel(GraphPredictions):
         return np.concatenate([np.log(chosen.clip(1e-9)), over.clip(-20.0)[:, None]], axis=1)
 
     def _described(self, held_out: TransitionBatch) -> tuple[tuple[VariableReport, ...], float | None]:
-        """Figures of each variable on some held-out transitions."""
+        """Reports of the variables, and the calibration, on some held-out rows."""
         some = thinned(held_out, DESCRIBED)
         return describe(self.cardinalities, self.marginals(some.states, some.actions), some, self._variables())
 
@@ -263,7 +263,7 @@ class DecisionGraphModel(GraphPredictions):
         return flat_variables(self.fitted.layout, self.fitted.usual, self.fitted.synchronic)
 
     def _memory(self, train: TransitionBatch, held_out: TransitionBatch) -> float | None:
-        """Gain in log-likelihood from the previous step, in nats for each transition; see FitReport."""
+        """Gain in log-likelihood from also knowing the previous step, in nats per transition; see FitReport."""
         known, tests = steps_in_a_row(train, SOME_ROWS), steps_in_a_row(held_out, SOME_TESTS)
         if min(len(known[0]), len(tests[0])) < 2:
             return None
@@ -283,7 +283,7 @@ class DecisionGraphModel(GraphPredictions):
         return DecisionGraphModel(space.cardinalities, self.n_actions, parts=self.parts)
 
     def _quick_log_probs(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
-        """Log-probabilities of transitions after a quick fit to others; the fitted model is restored afterwards."""
+        """Log-probabilities of ``tests`` after a quick fit to ``train``; the previous fit is restored afterwards."""
         before = self._snapshot()
         self._fit_quickly(train)
         logs = self.log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
@@ -310,7 +310,7 @@ class DecisionGraphModel(GraphPredictions):
         return max(likelihood, without), likelihood > without
 
     def _report(self, sizes: tuple[int, int], likelihood: float, exact: float, figures: Mapping[str, float]) -> FitReport:
-        """The report of a fit to ``sizes`` training and held-out rows; without the latter, it has no held-out scores."""
+        """The report of a fit with ``sizes`` (training, held-out) rows; if none were held out, it has no held-out scores."""
         held_out = sizes[1] > 0
         splits = [sum(split.feature >= 0 for split in search.splits) for search in self.fitted.found]
         return FitReport(
@@ -324,7 +324,7 @@ class DecisionGraphModel(GraphPredictions):
         )
 
     def _resets(self, data: TransitionDataset, seed: int) -> Bools:
-        """Which rows are resets; none if held-out likelihood is better without a regime of resets."""
+        """Which rows are resets, bool [N]; none unless a separate regime for resets improves held-out likelihood."""
         rows = data.rows()
         resets, gain, tested = flag_resets(rows.before, rows.after), 0.0, 0
         for split in range(MOST_FOLDS if resets.sum() >= FEWEST_RESETS else 0):
@@ -366,7 +366,7 @@ class DecisionGraphModel(GraphPredictions):
     def _log_probs_with_effects(
         self, effect_models: Mapping[int, EffectModel], train: TransitionBatch, resets: Bools, held_out: TransitionBatch
     ) -> Floats:
-        """Log-probability of the held-out next values of K factors under the given effects, [N, K]."""
+        """Log-probability [N, K] of the held-out next values of the K factors, each under its given effect."""
         flagged = all_redrawn(resets, len(self.cardinalities))
         self.fitted = fit_graphs(self.cardinalities, self.encoding, train, flagged, False, False, effect_models)
         start = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64)

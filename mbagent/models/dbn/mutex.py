@@ -1,8 +1,8 @@
-"""Mutually exclusive bits: groups of which exactly one, or at most one, is on (Helmert 2009).
+"""Mutually exclusive bits: groups in which exactly one bit, or at most one, is on (Helmert 2009).
 
-Groups of which exactly one is on, such as a position encoded one-hot, are found from data and become one variable (paper section
-2.1), so that their bits are drawn jointly. If at most one of some bits is on, each bit keeps its own graph and rate; these rates
-are the probabilities of one draw among the bits and "none".
+Groups with exactly one bit on, such as a one-hot encoded position, are found from data and become one variable (paper section
+2.1), so that their bits are drawn jointly. In groups with at most one bit on, each bit keeps its own graph and rate; a single
+draw selects one of the bits or "none", with the rates as probabilities.
 """
 
 from __future__ import annotations
@@ -32,17 +32,18 @@ def find_groups(
 ) -> tuple[tuple[int, ...], ...]:
     """Groups of bits of which exactly one is on in every observed state.
 
-    Bits that were never on together and are often swapped (one is switched off in the step in which the other is switched on)
-    are collected greedily, the most frequent swaps first.
+    Groups are grown greedily, most frequent swaps first, from bits that were never on together and often swap (in one step, one
+    is switched off and the other on).
 
     Args:
         cardinalities: number of values of each factor, length F.
         states: int [N, F].
         next_states: int [N, F].
-        usual: bool [N], transitions in which swaps are counted (resets, which redraw everything, swap any bits); None: all.
+        usual: bool [N], transitions in which swaps are counted (not resets, which redraw everything and may swap any bits);
+            None: all.
 
     Returns:
-        Factors of each group, ascending, three or more.
+        Factors of each group: at least three, in ascending order.
     """
     bits = np.flatnonzero(np.asarray(cardinalities) == 2)
     if len(bits) < 3 or len(states) == 0:
@@ -71,11 +72,11 @@ def find_groups(
 
 
 def find_cliques(together: NDArray[np.int64], expected: NDArray[np.float64]) -> list[NDArray[np.int64]]:
-    """Sets of bits of which no two were ever on together after a step, although independent bits would have been.
+    """Sets of bits of which no two were ever on together after a step, although independent bits sometimes would have been.
 
     Args:
-        together: how often two bits were on together, int64 [n, n].
-        expected: how often they would be if they were independent, [n, n].
+        together: how often each pair of bits was on together, int64 [n, n].
+        expected: how often each pair would be on together if independent, [n, n].
     """
     never = (together == 0) & (expected > EXPECTED)
     np.fill_diagonal(never, False)
@@ -89,7 +90,7 @@ def find_cliques(together: NDArray[np.int64], expected: NDArray[np.float64]) -> 
 
 
 def _grow(swaps: NDArray[np.floating[Any]], exclusive: Bools, free: Bools) -> NDArray[np.int64]:
-    """The clique around the strongest pair, in the order found; empty if no pair is left."""
+    """Bits of the clique grown from the strongest pair, in the order added; empty if no pair is left."""
     first, second = np.unravel_index(int(swaps.argmax()), swaps.shape)
     if swaps[first, second] == 0:
         return np.zeros(0, dtype=np.int64)
@@ -113,9 +114,10 @@ def widest(layout: Layout) -> int:
 
 @compiled
 def mutex_distribution(mutex: int, state: Ints, rates: Floats, still: Bools, layout: Layout, graphs: Graphs, out: Floats) -> int:
-    """Writes the probability of each bit of a mutex group, and of none, to ``out``; returns the number of bits.
+    """Writes to ``out`` the probability that each bit of a mutex group is on, then that none is; returns the number of bits.
 
-    ``rates`` are the distributions of all variables; bits without graphs (``still`` [U]) keep their value in ``state``.
+    ``rates`` are the distributions of all variables; ``still`` [U] marks those without graphs, whose bits keep their value in
+    ``state``.
     """
     first, last = layout.mutex_first[mutex], layout.mutex_first[mutex + 1]
     n, total = last - first, 0.0
@@ -134,7 +136,7 @@ def mutex_distribution(mutex: int, state: Ints, rates: Floats, still: Bools, lay
 def n_choices(mutex: int, state: Ints, rates: Floats, still: Bools, layout: Layout, graphs: Graphs) -> int:
     """Upper bound on the number of possible outcomes of a mutex group, at least 1.
 
-    One for each bit that may be on, and one for "no bit is on" unless a bit is certain.
+    Counts one outcome for each bit that may be on, and one for "no bit is on" unless some bit is certain to be on.
     """
     possible, sure = 0, False
     for k in range(layout.mutex_first[mutex], layout.mutex_first[mutex + 1]):
@@ -147,7 +149,7 @@ def n_choices(mutex: int, state: Ints, rates: Floats, still: Bools, layout: Layo
 
 @compiled
 def leave_out_none(chances: Floats, n: int) -> None:
-    """Removes "none", the last of ``n`` probabilities, if it is negligible compared with the largest: an error of the rates."""
+    """Sets "none", the last of ``n`` probabilities, to 0 if negligible relative to the largest (then an error of the rates)."""
     none, top = chances[n - 1], 0.0
     for k in range(n):
         top = max(top, chances[k])

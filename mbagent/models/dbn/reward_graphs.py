@@ -1,7 +1,8 @@
-"""Decision graphs that classify transitions, such as by their reward, from state, action and next state.
+"""Decision graphs that classify transitions, for example by reward, from state, action and next state.
 
-Each class but the most frequent has a graph that predicts whether a transition belongs to it. Graphs test single factors before
-and after the step, the action, and, on planes, adjacencies anywhere. Features are evaluated only when a graph tests them.
+Each class but the most frequent has a graph that predicts whether a transition belongs to it. Graphs test the action, single
+factors before or after the step and, on planes, adjacencies anywhere on the board before or after it. Features are evaluated
+only when a graph tests them.
 Shapes: B rows, F factors, C channels, D features, J graphs, K classes, W action classes.
 """
 
@@ -59,13 +60,15 @@ class ClassGraphs(NamedTuple):
     """The graphs, as arrays.
 
     Attributes:
-        features: kind and up to six parameters, int64 [D, 7].
-        cells: factor of each channel's cells, int64 [C, H, W]; empty without planes.
+        features: kind and up to six parameters of each feature, int64 [D, 7].
+        cells: factor number of each cell, int64 [C, H, W]; empty without planes.
         action_classes: action class of each action, int64 [A].
-        encoding: features of actions, bool [A, features].
-        classes: class of each graph, int64 [J].
-        first: first node for each graph and action class, -1 if the class was never observed under it, int64 [J, W].
-        node: feature (-1 at a leaf), and the next node if it is off and on, int64 [nodes, 3]; next nodes have smaller numbers.
+        encoding: features of each action, bool [A, action features].
+        classes: class that each graph predicts, int64 [J].
+        first: first node for each graph and action class, int64 [J, W]; -1 if the action class did not occur in the searched
+            rows.
+        node: (feature, next node if it is off, next node if it is on), int64 [nodes, 3]; the feature is -1 at a leaf, and next
+            nodes have smaller numbers.
         rate: probability of the class at a leaf, [nodes].
     """
 
@@ -86,7 +89,7 @@ def fit_classes(
 
     Args:
         rows: N transitions.
-        classes: class of each, int64 [N]; 0 is the most frequent.
+        classes: class of each transition, int64 [N]; 0 is the most frequent.
         cardinalities: number of values of each factor, length F.
         parts: number of values of each action component.
         planes: positions of the cells, if factors form planes.
@@ -118,7 +121,7 @@ def fit_classes(
 
 
 def cells_in(planes: PlaneLayout | None, n_factors: int) -> Ints:
-    """Factor of each channel's cells, int64 [C, H, W]; empty without planes."""
+    """Factor number of each cell, int64 [C, H, W]; empty without planes."""
     if planes is None:
         return np.zeros((0, 0, 0), dtype=np.int64)
     cells: Ints = np.ascontiguousarray(planes.to_planes(np.arange(n_factors)[None])[0], dtype=np.int64)
@@ -131,7 +134,7 @@ def _rates(nodes: Nodes) -> Floats:
 
 
 def _chosen(classes: Ints, most: int) -> Ints:
-    """Numbers of at most ``most`` rows for the search."""
+    """Numbers of the rows used in the search, at most ``most``."""
     if len(classes) <= most:
         return np.arange(len(classes))
     rare, common = np.flatnonzero(classes > 0), np.flatnonzero(classes == 0)
@@ -199,7 +202,7 @@ def _values(rows: TransitionBatch, layout: Layout, candidates: Ints, planes: Pla
 
 
 def _counted(graphs: ClassGraphs, rows: TransitionBatch, classes: Ints) -> Floats:
-    """Rates at the leaves, estimated from all rows and not only from those of the search."""
+    """Rates at the leaves, estimated from all rows, not only those used in the search."""
     rates = graphs.rate.copy()
     for j, k in enumerate(graphs.classes):
         parts = [leaves_of(graphs, j, part.states, part.actions, part.next_states) for part in rows.parts(10_000)]
@@ -243,7 +246,7 @@ def _leaf(
 
 @compiled
 def leaves_of(graphs: ClassGraphs, j: int, states: Ints, actions: Ints, following: Ints) -> Ints:
-    """Leaves of graph ``j`` that transitions [B] lead to, -1 for none."""
+    """Leaf of graph ``j`` that each transition reaches, int64 [B]; -1 for none."""
     features, cells, encoding, nodes = graphs.features, graphs.cells, graphs.encoding, graphs.node
     first, action_classes, result = graphs.first, graphs.action_classes, np.empty(len(actions), dtype=np.int64)
     for b in range(len(actions)):
@@ -255,7 +258,7 @@ def leaves_of(graphs: ClassGraphs, j: int, states: Ints, actions: Ints, followin
 
 @compiled
 def class_chances(graphs: ClassGraphs, n_classes: int, states: Ints, actions: Ints, following: Ints) -> Floats:
-    """Probability of each class of transitions, [B, K]; class 0 gets the probability that remains."""
+    """Probability of each class for each transition, [B, K]; class 0 gets the remaining probability."""
     features, cells, encoding, nodes = graphs.features, graphs.cells, graphs.encoding, graphs.node
     first, action_classes, classes, rate = graphs.first, graphs.action_classes, graphs.classes, graphs.rate
     result = np.zeros((len(actions), n_classes), dtype=np.float64)
@@ -276,7 +279,7 @@ def class_chances(graphs: ClassGraphs, n_classes: int, states: Ints, actions: In
 def check_graphs(
     state: Mapping[str, NDArray[Any]], cardinalities: Sequence[int], n_actions: int, n_classes: int, cells: Ints
 ) -> ClassGraphs:
-    """The graphs in arrays from a file.
+    """Validated graphs from the arrays of a file.
 
     Raises:
         ValueError: the arrays are not graphs of these factors, actions and classes.

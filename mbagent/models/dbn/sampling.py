@@ -1,9 +1,10 @@
-"""Sampling from decision graphs, compiled: next states and probabilities.
+"""Compiled sampling of next states from decision graphs, and their probabilities.
 
-Variables with synchronic arcs (graphs in ``synchronic``) are drawn after all others, given the values drawn so far (the paper's
-conditioner, section 3.2), but only in rows where they are uncertain without these arcs; ``terminated`` always uses its arcs.
-Shapes: B batch, F factors, U variables (the last two are ``terminated`` and the reset), Q mutex groups, D features, D' of them
-of single factors.
+Variables with synchronic arcs (graphs in ``synchronic``) are drawn after all others. If such a variable is uncertain without its
+arcs, it is drawn given the values drawn so far (the paper's conditioner, section 3.2); otherwise, the arcs are ignored.
+``terminated`` always uses its arcs.
+Shapes: B batch, F factors, U variables (the last two are ``terminated`` and the reset), Q mutex groups, D features (of which D'
+test single factors), M' adjacencies of the next state.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ class Work(Struct):
 
     Attributes:
         layout, graphs, synchronic: see ``fitting.Fitted``.
-        on: features, bool [D + D' + M'], those of the next state last.
+        on: which features are on, bool [D + D' + M']; features of the next state come last.
         values: current values of all variables, int64 [U].
-        rates: distributions of all variables, [sum of cardinalities].
+        rates: next-value distributions of all variables, [sum of cardinalities].
         still: which variables have no graphs, bool [U].
         later: which variables have synchronic arcs, bool [U].
         alone: variables with graphs that are drawn independently: those without mutex group and synchronic arcs, int64.
         every: all variables but the last, the reset, int64 [U - 1].
-        joint: the distribution of a mutex group or variable.
+        joint: room for the distribution of one mutex group or variable.
         following: a next state, int64 [F].
     """
 
@@ -113,7 +114,8 @@ def _pick(probs: Floats, start: int, n: int, u: float, otherwise: int) -> int:
 def sample(states: Ints, actions: Ints, keys: Keys, greedy: bool, w: Work, following: Ints, terminated: Bools) -> None:
     """Draws next states into ``following`` [B, F] and ``terminated`` [B], variable u of row b with random number u of key b.
 
-    ``following`` must be a copy of ``states``; with ``greedy``, each variable gets its most probable value instead.
+    ``following`` must initially be a copy of ``states``. If ``greedy``, each variable gets its most probable value instead of a
+    random one.
     """
     layout, synchronic, n_variables = w.layout, w.synchronic, len(w.layout.outputs)
     for b in range(len(states)):
@@ -141,7 +143,8 @@ def sample(states: Ints, actions: Ints, keys: Keys, greedy: bool, w: Work, follo
 def needs_synchronic(variable: int, action: int, w: Work) -> bool:
     """Whether a variable's synchronic arcs are needed for the current state and action, of which ``w`` has the rates.
 
-    For ``terminated`` always; for another variable, if several next values were observed or have non-negligible probability.
+    Always true for ``terminated``; for other variables, if several next values have non-negligible probability or were observed
+    in a leaf reached here.
     """
     n, graphs = w.layout.outputs[variable], w.graphs
     if variable == len(w.layout.outputs) - 2 or settled(w.rates, graphs.start[variable], n) < 0:
@@ -169,7 +172,7 @@ def _show_variable(variable: int, following: Ints, w: Work) -> None:
 
 @compiled
 def _draw(variable: int, u: float, w: Work, following: Ints, terminated: Bools, b: int) -> None:
-    """Draws a variable's value into a next state [F], or into ``terminated[b]``."""
+    """Draws a variable's next value into ``following`` [F]; for ``terminated``, into ``terminated[b]``."""
     chosen = _pick(w.rates, w.graphs.start[variable], w.layout.outputs[variable], u, w.values[variable])
     if variable == len(w.layout.outputs) - 2:
         terminated[b] = chosen == 1
@@ -188,7 +191,7 @@ def in_parts(n_rows: int, n_columns: int) -> Iterator[slice]:
 
 
 def log_prob(states: Ints, actions: Ints, following: Ints, terminated: Bools, w: Work) -> Floats:
-    """Log-probability [B] of next states [B, F] and ends [B]."""
+    """Joint log-probability [B] of next states [B, F] and ``terminated`` [B]."""
     layout, start, result = w.layout, w.graphs.start, np.zeros(len(states))
     alone = np.flatnonzero(layout.mutex_of[:-1] < 0)
     groups = np.flatnonzero(np.diff(layout.first) > 1)
@@ -215,7 +218,7 @@ def log_prob(states: Ints, actions: Ints, following: Ints, terminated: Bools, w:
 def conditionals(states: Ints, actions: Ints, following: Ints, w: Work) -> Floats:
     """Distribution of each variable, given the next values [B, F] of those that it depends on, [B, sum of cardinalities].
 
-    That of the last variable, the reset, is left out.
+    The entries of the last variable, the reset, are left at 0.
     """
     last, synchronic = w.graphs.start[-2], w.synchronic
     result = np.zeros((len(states), w.graphs.start[-1]), dtype=np.float64)
@@ -259,7 +262,7 @@ def _write_bits(out: Floats, start: Ints, ones: Floats) -> None:
 
 @compiled
 def settled(probs: Floats, start: int, n: int) -> int:
-    """The only one of ``n`` values whose probability is not negligible, or -1."""
+    """Index of the only one of ``n`` values with non-negligible probability; -1 if there are several."""
     best = 0
     for k in range(1, n):
         if probs[start + k] > probs[start + best]:
@@ -272,7 +275,7 @@ def settled(probs: Floats, start: int, n: int) -> int:
 
 @compiled
 def only_possible(probs: Floats, start: int, n: int) -> int:
-    """The only one of ``n`` values with a probability above 0, or -1."""
+    """Index of the only one of ``n`` values with a probability above 0; -1 if several or none."""
     best = -1
     for k in range(n):
         if probs[start + k] > 0.0:
@@ -284,7 +287,7 @@ def only_possible(probs: Floats, start: int, n: int) -> int:
 
 @compiled
 def uncertain(states: Ints, actions: Ints, w: Work, variables: Ints) -> Bools:
-    """In which rows the given variables need their synchronic graphs, bool [B, len(variables)]."""
+    """Whether each row needs the synchronic graphs of each given variable, bool [B, len(variables)]."""
     result = np.zeros((len(states), len(variables)), dtype=np.bool_)
     for b in range(len(states)):
         evaluate(states[b], actions[b], variables, w)

@@ -1,4 +1,4 @@
-"""Bayesian score of splits (exact gain in log marginal likelihood, compiled), and the state of the search for a target's splits.
+"""Compiled Bayesian score of splits (exact gain in log marginal likelihood), and the state of the search for a target's splits.
 
 Rows of a target belong to *contexts*. A *split* divides the rows of some contexts by a feature; on each side, either all these
 contexts share one rate (pooling: a wall is learned from all directions together), or each keeps a rate of its own. The evidence
@@ -41,15 +41,15 @@ class FeatureBlocks(Struct):
 
 
 class Target(Struct):
-    """A one-vs-rest target: patterns after which a value of a variable is possible, and how often it was observed.
+    """A one-vs-rest target: the patterns after which a variable's value is possible, and how often that value came next.
 
     Attributes:
-        rows: numbers of the patterns in the feature table, int64 [R].
+        rows: row of each pattern in the feature table, int64 [R].
         counts: how often each pattern was observed, int64 [R].
         positives: how often the value came next, int64 [R].
         context: context of each pattern, 0 ... C - 1, int64 [R].
         action: action class of each context, int64 [C]; -1 if contexts of several classes were merged.
-        value: the variable's current value in each context, int64 [C]; -1 if several were merged.
+        value: the variable's current value in each context, int64 [C]; -1 if contexts of several values were merged.
     """
 
     rows: Ints
@@ -66,7 +66,7 @@ class Chosen(NamedTuple):
     Attributes:
         gain: gain in log evidence, including the log prior odds; 0 if no split has a positive gain.
         kind: BY_ALL, BY_ACTION, BY_VALUE or BY_CONTEXT.
-        which: the action, the value or the context.
+        which: action class, value or context, according to ``kind``.
         feature: the feature that divides the rows.
     """
 
@@ -98,7 +98,7 @@ class Tables(Struct):
 
 
 def evidence_tables(n: int, certain: float = 0.0, strength: float = STRENGTH) -> Tables:
-    """Tables from which ``evidence`` of up to ``n`` rows is computed.
+    """Lookup tables from which ``evidence`` is computed for up to ``n`` rows.
 
     Args:
         n: maximum number of rows.
@@ -123,7 +123,7 @@ def evidence(positives: int, n: int, tables: Tables) -> float:
 
 
 def evidences(positives: Ints, n: Ints, tables: Tables) -> Floats:
-    """As ``evidence``, of many."""
+    """As ``evidence``, for arrays."""
     one, two, alike = tables.one, tables.two, tables.alike
     result: Floats = np.where((positives == 0) | (positives == n), alike[n], one[positives] + one[n - positives] - two[n])
     return result
@@ -133,8 +133,8 @@ class Tally(Struct):
     """Counts of a target's rows.
 
     Attributes:
-        n, e: rows and positives of each context, int64 [C].
-        on, positives_on: those with each feature on, int64 [C, D].
+        n, e: counts and positives of each context, int64 [C] each.
+        on, positives_on: counts and positives with each feature on, int64 [C, D] each.
     """
 
     n: Ints
@@ -144,7 +144,7 @@ class Tally(Struct):
 
 
 def count(target: Target, features: FeatureBlocks) -> Tally:
-    """Counts rows and positives of each context, in all and with each feature on."""
+    """Counts rows and positives of each context, in total and with each feature on."""
     counts = np.zeros((2, len(target.action)), dtype=np.int64)
     on = np.zeros((2, len(target.action), features.n_features), dtype=np.int64)
     tally = Tally(*counts, *on)
@@ -168,9 +168,10 @@ class Sets(Struct):
     """Sets of contexts that a split can apply to: all, those of each action, those of each current value; and work space.
 
     Attributes:
-        n_actions: number of sets of actions.
-        of: numbers of the sets that contain each context, int64 [C, 3]; the last set is a placeholder that is never used.
-        base: evidence of each context's own rate, [C].
+        n_actions: number of sets for action classes.
+        of: numbers of the sets that contain each context, int64 [C, 3]; the last set, never scored, collects contexts without a
+            single action or value.
+        base: evidence of each context with a rate of its own, [C].
         counts: rows and positives of each set; rows and positives with a feature on, int64 [S, 4].
         evidence: evidence of a set's contexts with separate rates: of all rows; with a feature on; with it off, [S, 3].
     """
@@ -185,13 +186,14 @@ class Sets(Struct):
 def best_split(target: Target, tally: Tally, prior: Floats, narrow: Floats, tables: Tables) -> Chosen:
     """The split with the highest gain.
 
-    On either side of the split, the contexts of the set share one rate or have a rate each, whichever has more evidence.
+    On each side of the split, the contexts of the set either share one rate or have separate rates, whichever has more evidence.
 
     Args:
         target: the rows, with both outcomes.
-        tally: their counts.
-        prior: log prior odds of a split by each feature in all contexts, [D]; -inf for features that are excluded.
-        narrow: log prior odds to be added for contexts of one action, of one value, and for a single context, [3].
+        tally: counts of the rows.
+        prior: log prior odds of a split of all contexts by each feature, [D]; -inf for excluded features.
+        narrow: log prior odds added if a split applies only to one action class, one current value or one context, in this
+            order, [3].
         tables: ``evidence_tables`` for at least the sum of the target's counts.
     """
     n_actions, n_contexts = int(target.action.max()) + 1, len(target.action)
@@ -272,7 +274,7 @@ class Pair(NamedTuple):
         gain: gain in log evidence, including the log prior odds.
         context: the context.
         first, second: the features.
-        pattern: which cells get a context of their own, see ``split_search.PATTERNS``.
+        pattern: which of the four cells are separated into a new context, see ``split_search.PATTERNS``.
     """
 
     gain: float
@@ -288,7 +290,7 @@ class Split:
 
     Attributes:
         feature: the feature; -1 if contexts are only merged or renumbered.
-        off, on: the new context of each old one if the feature is off and on, int64 [C each].
+        off, on: new context of each old context if the feature is off, or on, int64 [C] each.
         gain: gain in log evidence, including the log prior odds, in nats.
     """
 
@@ -304,9 +306,9 @@ class Search:
 
     Attributes:
         target: the target, with contexts as split so far.
-        prior_mean: for each context, the rate of the rows on its side of the last split that it was part of, [C]: the prior mean
-            for contexts with few rows.
-        splits: in the order found.
+        prior_mean: prior mean of each context's rate, which matters if it has few rows, [C]: the rate of all rows on the
+            context's side of the last split that covered it.
+        splits: splits in the order found.
         open: whether further splits are possible.
     """
 
@@ -317,13 +319,13 @@ class Search:
     _tally: Tally | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        """Starts with the rate of all rows."""
+        """Initialises prior means to the overall rate."""
         positives, counts = int(self.target.positives.sum()), int(self.target.counts.sum())
         self.open = 0 < positives < counts
         self.prior_mean = np.full(len(self.target.action), positives / counts if counts else 0.5)
 
     def counts(self, rows: Bools | None = None) -> tuple[Ints, Ints]:
-        """Counts and positives of each context, int64 [C] each; only of the rows in the mask ``rows`` [R], if given."""
+        """Counts and positives of each context, int64 [C] each, restricted to the rows in the mask ``rows`` [R] if given."""
         target, size = self.target, len(self.target.action)
         some = slice(None) if rows is None else rows
         context, counts, positives = target.context[some], target.counts[some], target.positives[some]
@@ -331,7 +333,7 @@ class Search:
         return n, e
 
     def tally(self, features: FeatureBlocks) -> Tally:
-        """Counts of each context with each feature on, cached up to ``MOST_KEPT`` counts."""
+        """The tally of the target's rows, cached if ``Tally.on`` has at most ``MOST_KEPT`` entries."""
         if self._tally is not None:
             return self._tally
         tally = count(self.target, features)
@@ -340,7 +342,7 @@ class Search:
         return tally
 
     def merge(self, tables: Tables) -> None:
-        """Merges all contexts if one common rate has more evidence."""
+        """Merges all contexts if one common rate has more evidence than separate rates."""
         n, e = self.counts()
         if len(n) > 1 and _share(n, e, tables):
             merged, nowhere = np.zeros(len(n), dtype=np.int64), np.zeros(len(self.target.rows), dtype=np.bool_)
@@ -380,7 +382,7 @@ class Search:
         self._take(Split(pair.second, *sides_to, 0.0), table[target.rows, pair.second], prior_mean)
 
     def renamed(self, numbers: Ints) -> Search:
-        """This search, after its features were renumbered in place."""
+        """Replaces each feature d by ``numbers[d]`` in place; returns this search."""
         for i, split in enumerate(self.splits):
             if split.feature >= 0:
                 self.splits[i] = replace(split, feature=int(numbers[split.feature]))
@@ -412,6 +414,6 @@ class Search:
 
 
 def _share(n: Ints, e: Ints, tables: Tables) -> bool:
-    """Whether one common rate of contexts with these counts has more evidence than a rate for each."""
+    """Whether one common rate for contexts with these counts has more evidence than separate rates."""
     pooled = evidences(e.sum(keepdims=True), n.sum(keepdims=True), tables)[0]
     return bool(pooled > evidences(e, n, tables).sum())

@@ -1,9 +1,9 @@
 """Greedy search for the splits of decision graphs, by single features and by pairs (paper section 5, modules).
 
-The most certain splits provide a prior for the others: which kinds of features are relevant, whether one feature serves many
-targets or each target has its own, and how many splits a target has. With little data this prior decides. If two features matter
-only jointly, as in exclusive or, neither has a gain by itself. So all pairs are scored together (depth-two lookahead, Murthy and
-Salzberg 1995): the counts of their four cells in a context are one matrix product.
+The most certain splits are made first and provide a prior for the others: which kinds of features are relevant, whether targets
+share features, and how many splits a target has. With little data, this prior is decisive. If two features matter only jointly,
+as in XOR, neither has a gain by itself. So all pairs are scored together (depth-two lookahead, Murthy and Salzberg 1995): in
+each context, a matrix product yields the counts of every pair's four on/off combinations.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class PairSearch:
         self._found: list[Pair] = []
 
     def divide(self, searches: Sequence[Search]) -> bool:
-        """One round over all targets that changed since the last; returns whether any pair was found."""
+        """Searches all open targets that changed since the previous round; returns whether any pair was found."""
         prior, found = self._prior(), False
         for h, search in enumerate(searches):
             if not search.open or self._n_searched.get(h) == len(search.splits):
@@ -136,7 +136,7 @@ class PairSearch:
 def find_pairs(
     target: Target, contexts: Sequence[int], table: Bools, prior: Floats, patterns: Floats, tables: Tables
 ) -> list[Pair]:
-    """The best pair, then further ones in the same context that have no features in common with the pairs before.
+    """The best pair, then further pairs in the same context that share no features with the earlier pairs.
 
     Args:
         target: the rows.
@@ -162,7 +162,7 @@ def find_pairs(
 
 
 def _most_informative(table: Bools, counts: Ints, positives: Ints, tables: Tables) -> Ints:
-    """Numbers of the features in pairs, ascending: all of them, or those with the largest gain by themselves."""
+    """Numbers of the features to pair, ascending: all, or the ``MOST_PAIRED_FEATURES`` with the largest individual gains."""
     n_features = table.shape[1]
     if n_features <= MOST_PAIRED_FEATURES:
         return np.arange(n_features)
@@ -192,7 +192,7 @@ def _in_context(
 
 
 def _both(on: Bools, weights: Ints) -> Ints:
-    """Weight of the rows in which both of two features are on, int64 [D, D]; only the upper triangle is valid."""
+    """Total weight of the rows in which both features of each pair are on, int64 [D, D]; only the upper triangle is valid."""
     per_row = on.sum(axis=1)
     if SPARSE * float((per_row**2).sum()) < float(on.size) * on.shape[1]:
         first = np.concatenate([[0], np.cumsum(per_row)]).astype(np.int64)
@@ -206,7 +206,7 @@ def _both(on: Bools, weights: Ints) -> Ints:
 
 @compiled
 def _count_both(first: Ints, feature: Ints, weights: Ints, n_features: int) -> Ints:
-    """As ``_both``, of features in compressed sparse row format, ascending in each row."""
+    """As ``_both``, for features in compressed sparse row format, in ascending order within each row."""
     both = np.zeros((n_features, n_features), dtype=np.int64)
     for r in range(len(weights)):
         for i in range(first[r], first[r + 1]):
@@ -221,7 +221,7 @@ def _best_patterns(
 ) -> tuple[Floats, Ints]:
     """Gain of each pair of features under its best pattern, [D, D], and the pattern's number.
 
-    Only entries above the diagonal are pairs.
+    Only entries above the diagonal are valid.
     """
     size = len(both_n)
     best, which = np.zeros((size, size)), np.zeros((size, size), dtype=np.int64)
@@ -258,16 +258,16 @@ MOST_SPLITS_A_GRAPH = 256
 
 
 def find_splits(targets: Sequence[Target], table: Bools, kinds: Ints, n_actions: int, in_pairs: bool = True) -> list[Search]:
-    """A finished search for each target: its splits, and its rows with the contexts that they lead to.
+    """A finished search for each target: its splits, and its rows with their final contexts.
 
-    A first search estimates the share of deterministic rates, which the second one uses in its score.
+    A first search estimates the share of deterministic rates (0 or 1); a second search scores splits with this share.
 
     Args:
         targets: the targets.
         table: features of all distinct patterns, bool [N, D].
-        kinds: kind of each feature, int64 [D]; splits by features of one kind make others of that kind more probable.
+        kinds: kind of each feature, int64 [D]; a split by one feature makes splits by others of its kind more probable.
         n_actions: number of action classes.
-        in_pairs: whether to search for pairwise splits, too.
+        in_pairs: whether to also search for pairwise splits.
     """
     features = feature_blocks(table)
     most = max((int(target.counts.sum()) for target in targets), default=0) + 1

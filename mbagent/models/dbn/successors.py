@@ -1,7 +1,7 @@
 """Predictions of decision graphs: samples, exact probabilities, and successors in compiled code (``systematic_sampling.py``).
 
-Here every variable is evaluated in every row. Compiled search does so for models with resets or synchronic arcs other than
-termination's, see ``WholeKernel``; for all others it uses ``expander.py``.
+This module evaluates every variable in every row. Compiled search does the same, by ``WholeKernel``, for models with resets, or
+with synchronic arcs of variables other than ``terminated``. For all other models, it uses ``expander.py``.
 Shapes: B rows, F factors, U variables (the last two are ``terminated`` and the reset), Q mutex groups.
 """
 
@@ -282,10 +282,10 @@ def _weigh_by(share: float, first: int, n: int, out: Outcomes) -> None:
 
 
 class WholeKernel(Struct):
-    """Decision graphs for compiled search, for models with resets or synchronic arcs.
+    """Graphs for compiled search in models with resets or synchronic arcs (beyond those of ``terminated``).
 
     Attributes:
-        layout, usual, synchronic, reset, reset_synchronic, has_reset: see ``fitting.Fitted``; for planning.
+        layout, usual, synchronic, reset, reset_synchronic, has_reset: see ``fitting.Fitted``; the graphs are those for planning.
     """
 
     layout: Layout
@@ -381,7 +381,7 @@ class GraphPredictions(BaseTransitionModel):
         return following, over
 
     def _draw(self, states: States, actions: Actions, keys: Keys, greedy: bool = False) -> tuple[States, Bools]:
-        """Draws by keys, or takes the most probable value of each variable."""
+        """Samples with ``keys``; if ``greedy``, takes each variable's most probable value instead."""
         following, over = states.copy(), np.zeros(len(states), dtype=np.bool_)
         sampling.sample(states, actions, keys, greedy, self._work(), following, over)
         uniform = 0.5 if greedy else uniforms(derive(keys, _RESET), 1)[:, 0]

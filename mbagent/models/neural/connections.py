@@ -38,11 +38,12 @@ class PruningConfig:
 
     Attributes:
         gradual: whether connections are removed gradually during training; False: all at once before training (the paper).
-        removal: share of the training during which connections are removed.
-        steps: number of removals in that time.
-        shrink: weight of an L1 penalty in the loss during that time, which makes useless weights small.
-        evidence: whether connections that the transitions do not support are removed as well, beyond the given share (see
-            ``pruning``); False: only the smallest ones. Weights shared over positions are not examined.
+        removal: share of the training, from its start, during which connections are removed.
+        steps: number of rounds of removal in that time.
+        shrink: weight of the L1 penalty that is added to the loss during that time, to make useless weights small.
+        evidence: whether to remove, in addition to the given share, all other connections that the transitions do not support
+            (see ``pruning``); False: only the smallest ones are removed. Weights shared over positions are not tested for
+            support.
     """
 
     gradual: bool = True
@@ -56,8 +57,8 @@ class Connections:
     """The weights of a network that are connections, and which of them remain.
 
     Args:
-        module: the network; biases and weights that its own masks disable are not connections.
-        zeros_gone: whether weights that are exactly 0 are removed connections.
+        module: the network; its biases, and weights that its own masks disable, are not connections.
+        zeros_gone: whether weights that are exactly 0 count as removed connections.
     """
 
     def __init__(self, module: nn.Module, zeros_gone: bool = False) -> None:
@@ -96,7 +97,7 @@ class Shrinking:
 
     Args:
         connections: connections of the network.
-        fraction: the share to be removed by the end.
+        fraction: the share of connections to be removed by the end.
         config: see PruningConfig.
     """
 
@@ -120,7 +121,7 @@ class Shrinking:
         return self.config.shrink * torch.stack([p.abs().sum() for p in self.connections.weights.values()]).sum()
 
     def after_step(self, share: float) -> None:
-        """Called after a gradient step, when ``share`` of the training is completed."""
+        """Prunes after a gradient step; ``share`` is the share of the training that is completed."""
         due = math.floor(self.config.steps * min(share / self.config.removal, 1.0))
         if self.config.gradual and due > self._done:
             self._done = due
@@ -130,7 +131,7 @@ class Shrinking:
 
 
 def _possible(module: nn.Module, name: str, weight: nn.Parameter) -> Tensor:
-    """Mask of the weights that the module's own mask enables, bool."""
+    """Mask of the weights that their own layer's mask enables, bool."""
     owner = module.get_submodule(name.rpartition(".")[0])
     mask = getattr(owner, "mask", None)
     return torch.ones_like(weight, dtype=torch.bool) if mask is None else mask.clone()
@@ -138,7 +139,7 @@ def _possible(module: nn.Module, name: str, weight: nn.Parameter) -> Tensor:
 
 @runtime_checkable
 class PrunableModel(Protocol):
-    """A transition model that has connections to remove; see ``NeuralTransitionModel.prune``."""
+    """A transition model with connections that can be removed; see ``NeuralTransitionModel.prune``."""
 
     def prune(
         self,
@@ -158,11 +159,11 @@ def prunable(model: TransitionModel, fitted: bool, n_transitions: int) -> Prunab
 
     Args:
         model: any transition model.
-        fitted: whether it is fitted.
-        n_transitions: number of transitions for training the remaining connections.
+        fitted: whether ``model`` is fitted.
+        n_transitions: number of transitions available for training the remaining connections.
 
     Raises:
-        TypeError: the model has no weights; the message suggests a solution.
+        TypeError: the model has no connections to prune; the message suggests a solution.
         ValueError: nothing is learned yet, or there are no transitions.
     """
     if not isinstance(model, PrunableModel):

@@ -1,4 +1,4 @@
-"""Conversion of torch modules to the plain arrays of the compiled kernels; evaluation of modules without a kernel."""
+"""Conversion of torch modules to plain arrays for the compiled kernels, and evaluation of modules that have no kernel."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ def in_chunks(predictor: nn.Module, states: States, actions: Actions) -> Floats3
 
 
 def pack_layout(codec: FactorCodec) -> Layout:
-    """Layout of the codec's factors among its columns."""
+    """Layout of the factors among the columns of ``codec``."""
     factor = codec.column_factor.numpy()
     start = np.searchsorted(factor, np.arange(len(codec.outputs))).astype(np.int64)
     return Layout(np.asarray(codec.outputs, dtype=np.int64), start, codec.n_state_columns, codec.n_actions, codec.n_steps)
 
 
 def pack_dense(predictor: DensePredictor) -> DenseWeights:
-    """A dense predictor's weights, padded to its widest hidden layer and to ``LANES``."""
+    """A dense predictor's weights, padded to the widest hidden layer, rounded up to a multiple of ``LANES``."""
     codec = predictor.codec
     layers = [layer for layer in predictor.layers if isinstance(layer, Affine)]
     sizes = [len(layer.bias) for layer in layers]
@@ -133,7 +133,7 @@ def _array(tensor: Tensor) -> Floats32:
 
 
 def as_rows(states: States, actions: Actions, n_factors: int) -> tuple[States, Actions]:
-    """Both as contiguous int64, as required by the compiled kernels, which do not check shapes."""
+    """Returns both as contiguous int64 arrays after checking their shapes, which the compiled kernels do not check."""
     states, actions = np.ascontiguousarray(states, dtype=np.int64), np.ascontiguousarray(actions, dtype=np.int64)
     if states.ndim != 2 or states.shape[1] != n_factors or actions.shape != (len(states),):
         raise ValueError(

@@ -70,7 +70,7 @@ def number_strings(strings: Actions, n_actions: int) -> Actions:
 
 
 def longest_string(n_actions: int) -> int:
-    """Length of the longest strings that can be numbered; 1000 if there is only one action, when there is no limit."""
+    """Length of the longest strings that can be numbered. With only one action there is no limit, and the result is 1000."""
     n = 1
     while n_actions > 1 and n_actions ** (n + 1) <= LARGEST_NUMBER:
         n += 1
@@ -78,11 +78,12 @@ def longest_string(n_actions: int) -> int:
 
 
 def steps_apart(data: TransitionDataset, n: int, seed: int = 0) -> TransitionDataset:
-    """The transitions between states ``n`` steps apart, with the strings of actions between them as actions.
+    """Transitions between states that are ``n`` steps apart; the action of each is the string of actions in between.
 
-    An episode that terminates within the string stays in its last state; the remaining actions are random. Strings beyond
-    the end of a truncated episode are omitted; and if the longest episode was truncated, so are all strings that start less
-    than n steps before that limit: keeping only the terminated ones would overestimate the probability of termination.
+    If an episode terminates within a string, it stays in its last state, and the remaining actions of the string are random.
+    Strings that extend beyond the end of a truncated episode are omitted. If the longest episode was truncated, its length is
+    taken as the time limit, and strings that start less than n steps before this limit are omitted in all episodes. Keeping only
+    those that terminate would overestimate the probability of termination.
 
     Args:
         data: transitions of single steps, in the observed order within each episode.
@@ -137,18 +138,18 @@ def _far_from_limit(rows: TransitionBatch, n: int) -> Bools:
 
 
 class DirectForecastModel(BaseTransitionModel):
-    """A one-step model and separate models of several steps.
+    """A one-step model, and separate models for some larger numbers of steps.
 
-    As a transition model it behaves as its one-step model, so every planner can use it. ``forecast`` uses the other models:
+    As a transition model, it behaves like its one-step model, so every planner can use it. ``forecast`` uses the other models:
     their errors do not accumulate over steps, but a model of many steps is harder to learn.
 
     Args:
         one_step: the one-step model.
-        build: builds the model of n steps.
-        steps: the numbers of steps with a separate model, each at least 2.
+        build: function that builds the n-step model.
+        steps: the numbers of steps that get a separate model, each at least 2.
 
     Raises:
-        ValueError: a number of steps is below 2, or too large for numbering the strings of actions.
+        ValueError: a number of steps is below 2, or so large that the strings of actions cannot be numbered.
     """
 
     def __init__(self, one_step: BaseTransitionModel, build: ModelBuilder, steps: tuple[int, ...]) -> None:
@@ -168,7 +169,7 @@ class DirectForecastModel(BaseTransitionModel):
 
     @property
     def known(self) -> frozenset[int]:
-        """The numbers of steps for which a model is fitted."""
+        """The numbers of steps that have a fitted separate model."""
         return frozenset(self._known)
 
     def fit(self, data: TransitionDataset, *, seed: int = 0, progress: Callable[[float], None] | None = None) -> FitReport:
@@ -191,7 +192,8 @@ class DirectForecastModel(BaseTransitionModel):
     def forecast(self, states: States, strings: Actions, rng: Randomness) -> tuple[States, Bools]:
         """Samples the state after each string of actions, int64 [B, n], n >= 0.
 
-        Uses the model of n steps; if there is none, that of the largest number of steps below n, followed by single steps.
+        Uses the n-step model if it is fitted, else the fitted model with the largest number of steps below n, followed by single
+        steps.
 
         Returns:
             (states int64 [B, F], whether they are terminal bool [B]).
@@ -260,5 +262,5 @@ class DirectForecastModel(BaseTransitionModel):
 
 
 def random_strings(keys: Keys, n: int, n_actions: int) -> Actions:
-    """Random strings of actions, int64 [B, n], one row from each key."""
+    """Random strings of actions, int64 [B, n], one string for each key."""
     return (uniforms(keys, n) * n_actions).astype(np.int64)

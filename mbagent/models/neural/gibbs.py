@@ -1,6 +1,6 @@
 """Compiled Gibbs sampling of outcomes: the paper's sweeps (3.2), which resample each factor given all others.
 
-A block of rows starts with samples from the predictor and with the summed inputs of the uncertain factors.
+Each block of rows is initialised with samples from the predictor and with the summed inputs of the uncertain factors.
 """
 
 from __future__ import annotations
@@ -41,17 +41,18 @@ ALWAYS = 2.0
 
 
 class Block(NamedTuple):
-    """R rows; C columns of the next factors.
+    """Data of R rows; the next factors have C columns.
 
     Attributes:
-        guess: the next factors' columns, [R, C].
-        low: the conditioner is evaluated for a factor if its random number is below this bound, [R, O],
-        high: or at least this bound, [R, O]; in between, the factor has the predictor's most likely value.
+        guess: values of the next factors' columns, [R, C].
+        low: the conditioner is evaluated for a factor if the factor's random number is below this bound, [R, O];
+        high: also at or above this one, [R, O]. In between, the factor takes the predictor's most likely value (if it has no
+            group, its sample).
         top: that value, int64 [R, O].
-        slot: index of an open factor's sums, -1 if the factor is not open, int64 [R, O].
-        columns: all columns that are 1 initially, int64 [R, C + O + n_steps].
+        slot: row of ``sums`` for an open factor, -1 if the factor is not open, int64 [R, O].
+        columns: indices of all columns that are 1 initially, int64 [R, C + O + n_steps].
         n_columns: number of these columns, int64 [R].
-        sums: input of the groups of open factors, [slots, G]; the last is for any other factor.
+        sums: summed inputs of open factors' groups, [slots, G]; the last slot is for any factor that is not open.
     """
 
     guess: Floats32
@@ -68,16 +69,16 @@ class SweepWork(NamedTuple):
     """Work space for one row.
 
     Attributes:
-        active: input columns that are 1, int64 [O + n_steps].
+        active: indices of the input columns that are 1, int64 [O + n_steps].
         on: whether a column is 1 in the state, int64 [C].
-        columns: all columns that are 1 at present, int64 [C + O + n_steps].
-        shift: offset from a column to its index among a group's weight columns, by [1 in the state] + 2 [1 in the next state],
-            int64 [4].
+        columns: indices of all columns that are 1 at present, int64 [C + O + n_steps].
+        shift: number added to a column to get its index among a group's weight columns, int64 [4]; entry s + 2 n: s = 1 if the
+            column is 1 in the state, n = 1 if in the next state.
         chosen: factors that this sweep may change, int64 [O].
         noise: random number of each factor, [O].
-        rank: second random number of each factor, which determines the order, [O].
-        ranks: ranks of the chosen factors, [O].
-        order: the chosen factors in that order, int64 [O].
+        rank: second random number of each factor, which determines the order of resampling, [O].
+        ranks: ``rank`` of each chosen factor, [O].
+        order: the chosen factors in order of resampling, int64 [O].
         hidden: values of one group's hidden nodes, [1, G].
         row_logits: logits of one factor, [K].
         given: distribution of that factor, [K].
@@ -99,7 +100,7 @@ class SweepWork(NamedTuple):
 
 @compiled
 def work_space(n_rows: int, layout: Layout, group: GroupWeights) -> tuple[Block, SweepWork]:
-    """Work space for a block of ``n_rows`` rows, and for one row, of a model of this shape."""
+    """Work space for a block of up to ``n_rows`` rows, and for one row; ``layout`` and ``group`` give the shapes."""
     n_outputs, size, n_values = len(layout.outputs), group.bias.shape[1], group.offset.shape[1]
     n_columns, n_active, rows = group.both_start - group.next_start, n_outputs + layout.n_steps, min(n_rows, GIBBS_ROWS)
     n_slots = 1 + max(n_outputs, min(rows * n_outputs, MOST_SUMS // size))
@@ -181,7 +182,7 @@ def _draw_bits(probs: Floats, b: int, noise: Floats, factors: Ints) -> None:
 
 @vectorised
 def _bound_bits(probs: Floats, b: int, r: int, group_of: Ints, certain: float, low: Floats, high: Floats) -> None:
-    """Sets ``low`` and ``high`` as ``_begin_factor``."""
+    """Sets ``low`` and ``high`` as ``_begin_factor`` does."""
     for i in range(low.shape[1]):
         p0, p1 = probs[b, i, 0], probs[b, i, 1]
         trust = (max(p0, p1) >= certain) | (group_of[i] < 0)
@@ -193,7 +194,7 @@ def _bound_bits(probs: Floats, b: int, r: int, group_of: Ints, certain: float, l
 
 @vectorised
 def _likeliest_bits(probs: Floats, b: int, r: int, group_of: Ints, factors: Ints, top: Ints) -> None:
-    """Sets ``top`` as ``_begin_factor``."""
+    """Sets ``top`` as ``_begin_factor`` does."""
     for i in range(top.shape[1]):
         likeliest = int(probs[b, i, 1] > probs[b, i, 0])
         top[r, i] = likeliest if group_of[i] >= 0 else factors[b, i]
@@ -201,7 +202,7 @@ def _likeliest_bits(probs: Floats, b: int, r: int, group_of: Ints, factors: Ints
 
 @vectorised
 def _show_bits(probs: Floats, b: int, r: int, factors: Ints, low: Floats, real_guess: bool, guess: Floats32) -> None:
-    """Sets ``guess`` as ``_begin_factor``."""
+    """Sets ``guess`` as ``_begin_factor`` does."""
     for i in range(guess.shape[1]):
         real = real_guess & (low[r, i] == ALWAYS)
         guess[r, i] = np.float32(probs[b, i, 1] if real else float(factors[b, i]))
@@ -266,7 +267,7 @@ def sum_columns(
         columns: the columns that are 1.
         n_columns: number of these columns.
         group: the conditioner.
-        real_guess: whether some may have values between 0 and 1.
+        real_guess: whether columns of the next factors may lie between 0 and 1.
         k: the block.
         slot: row of ``k.sums``.
     """
@@ -295,10 +296,11 @@ _ORDER = np.uint64(1 << 32)
 
 @inlined
 def _shuffle(n: int, key: np.uint64, w: SweepWork) -> None:
-    """Lists the first ``n`` of ``w.chosen`` in a random order, in ``w.order``.
+    """Writes the first ``n`` factors of ``w.chosen`` to ``w.order`` in a random order.
 
-    The relative order of two factors does not depend on the other factors, so sweeps over some factors agree with those over
-    all. A factor's position is the number of factors before it, counted without branches, which would be unpredictable.
+    The relative order of two factors does not depend on the other factors, so a sweep over some factors visits them in the order
+    of a full sweep. A factor's position is the number of factors that precede it. Counting uses no branches, since they would be
+    unpredictable.
     """
     fill_row(key, w.rank)
     for step in range(n):
@@ -326,16 +328,18 @@ def sample_sweeps(
     Args:
         states: int64 [B, F].
         actions: int64 [B].
-        logits: the predictor's, float32 [B, O, K].
-        probs: the predictor's, float64 [B, O, K].
+        logits: the predictor's logits, float32 [B, O, K].
+        probs: the predictor's probabilities, float64 [B, O, K].
         keys: uint64 [B].
         layout: the factors.
         group: the conditioner, masked "others".
-        certain: a factor whose most likely value has at least this probability by the predictor takes that value in every sweep,
-            without the conditioner, unless its random number is so extreme that the conditioner could change the value by
-            raising the odds by the factor ``LEEWAY``. If it never raises them more, the samples are those of the full sweep.
+        certain: a factor is trusted if the predictor gives its most likely value at least this probability. In every sweep it
+            takes that value, and the conditioner is not evaluated, unless the factor's random number is so extreme that raising
+            the odds of another value by the factor ``LEEWAY`` could change the result. If the conditioner never raises odds by
+            more, the samples equal those of full sweeps.
         sweeps: number of passes, each in a new random order.
-        real_guess: the initial values are the predictor's probabilities; else bits drawn from them.
+        real_guess: True: open factors start from the predictor's probabilities; False: all factors start from values drawn from
+            them.
 
     Returns:
         Samples int64 [B, O].
@@ -369,7 +373,7 @@ def _sweep_row(
     work: SweepWork,
     factors: Ints,
 ) -> None:
-    """Performs the sweeps of row b, which is row r of its block, in ``factors`` [B, O]."""
+    """Performs the sweeps of row b, which is row r of its block; updates ``factors`` [B, O] in place."""
     states, logits, factors = borrowed(states), borrowed(logits), borrowed(factors)
     layout, group, k, w = borrowed(layout), borrowed(group), borrowed(block), borrowed(work)
     for sweep in range(sweeps):
@@ -394,7 +398,7 @@ def _sweep_row(
 
 @inlined
 def _choose(b: int, r: int, k: Block, w: SweepWork, factors: Ints) -> int:
-    """Writes the factors that this sweep may change to ``w.chosen``; returns their number."""
+    """Writes to ``w.chosen`` the factors that this sweep may change; returns their number."""
     n = 0
     for i in range(len(w.noise)):
         w.chosen[n] = i
@@ -406,7 +410,7 @@ def _choose(b: int, r: int, k: Block, w: SweepWork, factors: Ints) -> int:
 def _change(
     r: int, i: int, value: int, begin: int, end: int, layout: Layout, group: GroupWeights, k: Block, w: SweepWork
 ) -> None:
-    """Writes factor i's value to its columns; updates the open factors' sums at positions ``begin`` to ``end`` of the order."""
+    """Writes factor i's value to its columns; updates the sums of the open factors among ``w.order[begin:end]``."""
     n = layout.outputs[i]
     for v in range(1 if n == 2 else 0, n):
         column = layout.start[i] + (0 if n == 2 else v)

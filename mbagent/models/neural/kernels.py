@@ -1,7 +1,8 @@
-"""Compiled inference of the networks of ``networks.py``, row by row, with its inner loops.
+"""Compiled row-by-row inference for the networks of ``networks.py``, and its inner loops.
 
-Networks are trained by torch; here each row of a batch is computed separately, in a fixed order of operations. So a row's result
-is bitwise the same alone and in any batch, which matrix products do not guarantee, and inputs that are 0 need no time.
+Networks are trained by torch. Here, each row of a batch is computed separately, in a fixed order of operations, so a row's
+result is bitwise the same alone and in any batch. Matrix products do not guarantee this. The first layer skips inputs that are
+0.
 Shapes: B batch, F state factors, O = F + 1 output factors, K largest cardinality, G hidden nodes in a group, g groups.
 """
 
@@ -32,9 +33,9 @@ _P3, _P4, _P5 = np.float32(4.1665795894e-2), np.float32(1.6666665459e-1), np.flo
 
 @compiled
 def exp32(x: np.float32) -> np.float32:
-    """exp(x) with relative error 7e-8, x being clipped to [-87, 88]; unlike the library's function it can be vectorised.
+    """exp(x) for x clipped to [-87, 88], with relative error 7e-8; unlike the library's function, this one can be vectorised.
 
-    2^n times a polynomial (Moshier's Cephes library, ``expf``); n is written directly to the exponent bits.
+    Computed as 2^n times a polynomial (as in ``expf`` of Moshier's Cephes library); n is written directly to the exponent bits.
     """
     x = _LOWEST if x < _LOWEST else x
     x = _HIGHEST if x > _HIGHEST else x
@@ -63,7 +64,7 @@ def exp64(x: float) -> float:
 
 @vectorised
 def activate(table: Floats32, row: int, n: int, code: int) -> None:
-    """Applies the activation with this code to the first ``n`` values of ``table[row]``, in place."""
+    """Applies the activation given by ``code`` to the first ``n`` values of ``table[row]``, in place."""
     if code == RELU:
         for h in range(n):
             table[row, h] = max(table[row, h], np.float32(0.0))
@@ -97,8 +98,8 @@ def add_rows(table: Floats32, rows: Ints, n_rows: int, out: Floats32, row: int) 
 def add_products(values: Floats32, n_rows: int, n_values: int, weights: Floats32, out: Floats32) -> None:
     """Adds ``weights`` [4 * m, H] times the first ``n_values`` of ``values`` [R, H] to ``n_rows`` rows of ``out`` [R, 4 * m].
 
-    Four sums at a time, so that ``values`` are read a quarter as often. All rows are processed while the weights are cached; a
-    row's result does not depend on the other rows.
+    Computes four sums at a time, so that ``values`` is read a quarter as often. All rows are processed while the weights of
+    these sums are cached; a row's result does not depend on the other rows.
     """
     for k in range(0, weights.shape[0], 4):
         for r in range(n_rows):
@@ -119,7 +120,7 @@ def add_products(values: Floats32, n_rows: int, n_values: int, weights: Floats32
 def add_columns(table: Floats32, g: int, columns: Ints, n_columns: int, sums: Floats32, row: int) -> None:
     """Adds to ``sums[row]`` [G] the weights of group g for the first ``n_columns`` of ``columns``; ``table`` is [g, columns, G].
 
-    Four columns at a time, which halves the time, since ``sums`` is read and written a quarter as often.
+    Processes four columns at a time, so that ``sums`` is read and written a quarter as often; this halves the running time.
     """
     c = 0
     while c + 4 <= n_columns:
@@ -150,7 +151,7 @@ def copy_row(table: Floats32, row: int, out: Floats32, out_row: int) -> None:
 
 @vectorised
 def count_below(values: Floats, begin: int, end: int, limit: float, or_equal: bool) -> int:
-    """Number of ``values[begin:end]`` below a limit, or, with ``or_equal``, not above it."""
+    """Number of ``values[begin:end]`` that are < ``limit``, or <= ``limit`` if ``or_equal``."""
     n = 0
     if or_equal:
         for i in range(begin, end):
@@ -163,7 +164,7 @@ def count_below(values: Floats, begin: int, end: int, limit: float, or_equal: bo
 
 @vectorised
 def product(sums: Floats32, row: int, code: int, table: Floats32, g: int, k: int) -> np.float32:
-    """Scalar product of the activations of ``sums[row]`` [G] with ``table[g, k]`` [G]."""
+    """Scalar product of the activated ``sums[row]`` [G] with ``table[g, k]`` [G]; ``code`` selects the activation."""
     total = np.float32(0.0)
     if code == RELU:
         for h in range(table.shape[2]):
@@ -185,7 +186,7 @@ def product(sums: Floats32, row: int, code: int, table: Floats32, g: int, k: int
 
 @inlined
 def softmax(logits: Floats32, n: int, out: Floats) -> None:
-    """Writes the distribution over the first ``n`` values to ``out``."""
+    """Writes the softmax of the first ``n`` logits to ``out``."""
     if n == 2:  # one exponential instead of two: bits are the common case
         difference = np.float64(logits[1]) - np.float64(logits[0])
         small = math.exp(-abs(difference))
@@ -206,7 +207,7 @@ def softmax(logits: Floats32, n: int, out: Floats) -> None:
 
 @vectorised
 def write_bits(columns: Floats32, row: int, logits: Floats32, b: int) -> None:
-    """Writes row b of ``logits`` [B, O, 2] for factors that are all bits, from ``columns[row]``; the logit of value 0 is 0."""
+    """Writes row b of ``logits`` [B, O, 2] from ``columns[row]``, if all factors are bits; the logit of value 0 is 0."""
     for i in range(logits.shape[1]):
         logits[b, i, 0] = np.float32(0.0)
         logits[b, i, 1] = columns[row, i]
@@ -221,7 +222,7 @@ def add_signed(states: Ints, b: int, weights: Floats32, row: int, out: Floats32,
 
 @vectorised
 def _bit_probabilities(logits: Floats32, b: int, out: Floats) -> None:
-    """Row b of ``probabilities`` for factors that are all bits."""
+    """Computes row b of ``probabilities`` if all factors are bits."""
     for i in range(logits.shape[1]):
         difference = np.float64(logits[b, i, 1]) - np.float64(logits[b, i, 0])
         small = exp64(-abs(difference))
@@ -259,11 +260,11 @@ class Layout(NamedTuple):
     """Layout of factors among columns.
 
     Attributes:
-        outputs: cardinalities of the output factors, int64 [O]; the first F are the state's.
+        outputs: cardinalities of the output factors, int64 [O]; the first F are those of the state factors.
         start: first column of each output factor, int64 [O].
-        n_state_columns: columns of the state, followed by those of the action.
-        n_actions: actions A of a single step.
-        n_steps: actions in a string, see ``FactorCodec``.
+        n_state_columns: number of columns of the state; those of the action follow.
+        n_actions: number of actions A of a single step.
+        n_steps: number of actions in a string; see ``FactorCodec``.
     """
 
     outputs: Ints
@@ -277,14 +278,14 @@ class DenseWeights(NamedTuple):
     """A ``DensePredictor``: L hidden layers, padded to the widest of them, H; C output columns, padded to a multiple of four.
 
     Attributes:
-        first: from (state, action) columns, [n_inputs, H] (L = 0: [n_inputs, C]).
-        inner: to hidden layers 1 ... L - 1 from those before, [max(L - 1, 0), H to, H from].
-        bias: of the hidden layers, [L, H].
+        first: weights from the (state, action) columns, [n_inputs, H]; if L = 0, [n_inputs, C].
+        inner: weights between successive hidden layers, [max(L - 1, 0), H, H]; axis 1: nodes of the later layer.
+        bias: biases of the hidden layers, [L, H].
         sizes: padded sizes of the hidden layers, multiples of ``export.LANES``, int64 [L].
-        to_columns: to the output columns, [C, H].
+        to_columns: weights to the output columns, [C, H].
         column_bias: [C].
         stay: weights of the residual path, [n_steps * A, n_state_columns]; zero if there is none.
-        n_columns: output columns without padding.
+        n_columns: number of output columns without padding.
         activation: one of the codes in ACTIVATION_CODES.
     """
 
@@ -300,7 +301,7 @@ class DenseWeights(NamedTuple):
 
     @property
     def last(self) -> Floats32:
-        """``to_columns`` without padding, [H, n_columns]."""
+        """Transpose of ``to_columns`` without padded rows, [H, n_columns]."""
         return self.to_columns[: self.n_columns].T
 
     @property
@@ -314,14 +315,15 @@ class GroupWeights(NamedTuple):
 
     Attributes:
         group_of: group of each output factor, -1 if it has none, int64 [O].
-        columns: weights from all columns, [g, n_inputs + n_columns + n_state_columns, G]: of state and action, of the next
-            factors (zero where pruned), and the sums of both for columns that are 1 in the state and in the next state. Since
-            most columns are equal in both, this saves additions.
+        columns: weights from all columns, [g, n_inputs + n_columns + n_state_columns, G]: first those from state and action,
+            then those from the next factors (zero where masked or pruned), then the sum of each state column's two weights, used
+            if the column is 1 in both the state and the next state. Most columns are equal in the two states, so these sums save
+            additions.
         bias: [g, G].
-        to_values: to the logits of the group's factor, [g, K, G]; for a bit, the logit of 0 is 0.
+        to_values: weights to the logits of the group's factor, [g, K, G]; the logit of a bit's value 0 is 0.
         offset: [g, K].
         next_start: index of the first column of the next factors, n_inputs.
-        both_start: index of the first column for values that are 1 in both, n_inputs + n_columns.
+        both_start: index of the first of the summed weights in ``columns``, n_inputs + n_columns.
         activation: one of the codes in ACTIVATION_CODES.
         correction: whether the predictor's logits are added.
     """
@@ -376,8 +378,8 @@ def add_next(
 ) -> int:
     """Adds the column of factor i's next value to the list ``columns`` of ``active_columns``; returns its new length.
 
-    ``place`` is the index in the list of the factor's column in the state, if that is 1. Without branches, which would be
-    unpredictable.
+    ``place`` is the list index of the factor's state column that is 1, if any; if the value is unchanged, only this entry
+    changes. Uses no branches, since they would be unpredictable.
     """
     column, on = layout.start[i], 1
     if layout.outputs[i] == 2:
@@ -404,7 +406,7 @@ def next_place(states: Ints, b: int, i: int, layout: Layout, place: int) -> int:
 def _add_residual(
     states: Ints, b: int, active: Ints, n_active: int, layout: Layout, stay: Floats32, columns: Floats32, r: int
 ) -> None:
-    """Adds the residual path of each state column: its weight where the column is 1, minus its weight where it is 0."""
+    """Adds the residual path: for each state column, plus its weight if the column is 1, minus its weight if the column is 0."""
     n_on = n_active - layout.n_steps
     for step in range(n_on, n_active):
         row = active[step] - layout.n_state_columns

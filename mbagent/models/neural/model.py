@@ -37,8 +37,8 @@ class NeuralTransitionModel(NetworkPair):
     """A predictor network, alone or with a conditioner network. Arguments are those of NetworkPair.
 
     Attributes:
-        pruned_as: what a pruned model of bits is sampled from: truth "tables", if all bits have few inputs left, or the dense
-            "matrices" used before pruning.
+        pruned_as: how a pruned model of bits is sampled. "tables": from truth tables if all bits have few inputs left, else as
+            "matrices"; "matrices": from the dense weight matrices, as before pruning.
     """
 
     pruned_as: PrunedAs = "tables"
@@ -85,9 +85,9 @@ class NeuralTransitionModel(NetworkPair):
         """Removes the smallest weights of both networks and trains the remaining ones (paper section 5); see ``pruning``.
 
         Args:
-            data: the transitions to which the model was fitted; the same ``seed`` holds out the same rows.
-            fraction: smallest share of each network's connections that are removed, in [0, 1); further ones are removed if the
-                data do not support them (``PruningConfig.evidence``). Later calls keep connections removed; ``fit`` starts
+            data: the transitions to which the model was fitted; with the fit's ``seed``, the same rows are held out.
+            fraction: minimum share of each network's connections to remove, in [0, 1); further connections are removed if the
+                data do not support them (``PruningConfig.evidence``). Connections stay removed in later calls; ``fit`` starts
                 again with all connections.
             seed: seed of the held-out rows and of the batches.
             progress: called with the completed share, 0 ... 1.
@@ -275,10 +275,10 @@ class NeuralTransitionModel(NetworkPair):
         return self._rules[self.config.certain][settled]
 
     def modules(self) -> list[VariableGroup]:
-        """The independent groups of variables (paper section 5), largest first; see ``influence.modules``.
+        """The independent groups of variables (paper section 5), largest first; see ``pruning.modules``.
 
         Raises:
-            ValueError: weights are shared over positions, or the predictor is not a dense one.
+            ValueError: the predictor is not dense, for example because its weights are shared over positions.
         """
         return modules(influence(self, effective=True))
 
@@ -300,7 +300,7 @@ class NeuralTransitionModel(NetworkPair):
         return self._groups
 
     def _predict(self, states: States, actions: Actions) -> tuple[Floats32, Floats]:
-        """The predictor's logits float32 and probabilities float64, [B, O, K]."""
+        """The predictor's logits, float32 [B, O, K], and probabilities, float64 [B, O, K]."""
         if self._forward is None:
             self._forward = compiled_body(self.predictor, self._layout)
         logits = self._forward(states, actions)

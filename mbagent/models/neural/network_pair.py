@@ -36,8 +36,8 @@ class NetworkPair(BaseTransitionModel):
         cardinalities: number of values of each state factor, length F.
         n_actions: number of enumerated actions A of a single step.
         config: see NeuralConfig.
-        body: builds a predictor body other than the dense one.
-        n_steps: number of actions in the string that is one action of this model (paper 4.2); see ``FactorCodec``.
+        body: function that builds a predictor body to replace the dense one.
+        n_steps: length of the string of actions that forms one action of this model (paper 4.2); see ``FactorCodec``.
         seed: seed of the initial weights; ``fit`` uses its own seed.
     """
 

@@ -2,7 +2,8 @@
 
 The paper's variables are bits; here a variable is a *factor* with any number of values (a bit is a factor with two), and
 termination is an additional output factor, the last. On planes, weights are shared over positions (paper section 5), so the
-effect of a wall is learned once, not for every cell; for strings of actions (paper 4.2) the body is applied once per action.
+effect of a wall is learned once, not for every cell. For strings of actions on planes (paper 4.2), the same block is applied
+once per action.
 Shapes: B batch, F state factors, O = F + 1 output factors, K largest cardinality, G hidden nodes in a group.
 """
 
@@ -47,19 +48,19 @@ three times as fast as all at once for large groups, but half as fast for small 
 class FactorCodec(nn.Module):
     """Converts factors to network inputs, and columns of network outputs to logits.
 
-    A factor with two values is one 0/1 column, as in the paper; one with k > 2 values is k columns, one of them 1.
+    A factor with two values is one 0/1 column, as in the paper; a factor with any other number k of values is k one-hot columns.
 
     Args:
         cardinalities: number of values of each state factor, length F.
         n_actions: number of enumerated actions A.
-        n_steps: number of actions in the string that is one action of the model (paper 4.2: "each action in the string
-            occupies an additional group of inputs"). The first action is the lowest digit of the string's number in base A.
+        n_steps: length of the string of actions that forms one action of the model (paper 4.2: "each action in the string
+            occupies an additional group of inputs"). Strings are numbered in base A; the first action is the lowest digit.
 
     Attributes:
         outputs: cardinalities of the O = F + 1 output factors; the last is ``terminated``.
         width: K, the largest of ``outputs``.
-        n_inputs: columns of (state, action).
-        n_columns: columns of the output factors.
+        n_inputs: number of columns of (state, action).
+        n_columns: number of columns of the output factors.
     """
 
     def __init__(self, cardinalities: Sequence[int], n_actions: int, n_steps: int = 1) -> None:
@@ -89,17 +90,17 @@ class FactorCodec(nn.Module):
         self.register_buffer(name, value, persistent=False)
 
     def inputs(self, states: Tensor, actions: Tensor) -> Tensor:
-        """Columns of a state and an action, float [B, n_inputs], from int64 [B, F] and int64 [B]."""
+        """Columns of (state, action), float [B, n_inputs], from states int64 [B, F] and actions int64 [B]."""
         n = self.n_state_columns
         state = self._one_hot(states, self.column_factor[:n], self.column_value[:n])
         return torch.cat((state, self.action_columns(actions)), dim=1)
 
     def action_columns(self, actions: Tensor) -> Tensor:
-        """One-hot columns of the actions of a string, in order: float [B, n_steps * A] from int64 [B]."""
+        """One-hot columns of the actions in each string, in order: float [B, n_steps * A], from strings int64 [B]."""
         return torch.cat([self.single_actions[step] for step in self.action_steps(actions)], dim=1)
 
     def action_steps(self, actions: Tensor) -> list[Tensor]:
-        """The actions of a string in order, each int64 [B]."""
+        """The first, second, ... action of each string, each int64 [B]."""
         if self.n_steps == 1:
             return [actions]
         return [actions // self.n_actions**k % self.n_actions for k in range(self.n_steps)]
@@ -137,8 +138,8 @@ class Affine(nn.Module):
         n_in: inputs.
         n_out: outputs.
         generator: source of the weights.
-        mask: bool [n_out, n_in], False for pruned weights, which are zero and get no gradient. None: no weight is pruned.
-        fan_in: number of connections of one output, for the size of the initial weights (default: n_in).
+        mask: bool [n_out, n_in], False for disabled weights, which are zero and get no gradient. None: all weights are enabled.
+        fan_in: number of inputs connected to one output, which sets the scale of the initial weights (default: n_in).
     """
 
     def __init__(
@@ -170,7 +171,8 @@ class Dropout(nn.Module):
     ``nn.Dropout`` would draw from the process-wide generator. The trainer sets and removes ``generator``.
 
     Args:
-        share: fraction of inputs zeroed, in [0, 1), rounded to 1/256; the others are scaled up to keep the mean.
+        share: fraction of inputs zeroed, in [0, 1), rounded to a multiple of 1/256; the others are scaled up to preserve the
+            mean.
     """
 
     def __init__(self, share: float) -> None:
@@ -179,7 +181,7 @@ class Dropout(nn.Module):
         self.generator: torch.Generator | None = None
 
     def forward(self, values: Tensor) -> Tensor:
-        """Values of the same shape."""
+        """Values after dropout, same shape."""
         if self.generator is None or self.share == 0.0:
             return values
         # The eight bytes of a random word are used for eight values: bernoulli_ would take a third of a training step.
@@ -193,9 +195,9 @@ class DensePredictor(nn.Module):
 
     Args:
         codec: the factors.
-        hidden: sizes of the hidden layers (the paper: one of 2d + 1).
+        hidden: sizes of the hidden layers (the paper: a single layer of size 2d + 1).
         activation: of the hidden nodes (the paper: sigmoid).
-        residual: adds a learned path from each s_i to s'_i, one weight for each (action column, factor).
+        residual: whether to add a learned path from each s_i to s'_i, with one weight for each (action column, state column).
         dropout: share of hidden nodes zeroed in each training step.
         generator: source of the initial weights.
     """
@@ -241,19 +243,20 @@ class DensePredictor(nn.Module):
 class Conditioner(nn.Module):
     """The conditioner network (paper 3.2): output i is the distribution of y_i given (s, a) and other next factors.
 
-    The hidden layer consists of groups, one for each output. The inputs of group i are (s, a) and, of the next factors, y_<i
-    (mask "causal") or all but y_i (mask "others"); output i depends only on group i, hence not on y_i. Outputs of which
-    the predictor is certain need no group: their logits are 0 here, so that the predictor's are unchanged.
+    The hidden layer consists of groups, one for each output. The inputs of group i are (s, a) and either the next factors y_<i
+    (mask "causal") or all next factors except y_i (mask "others"). Output i depends only on group i, hence not on y_i. Outputs
+    of which the predictor is certain need no group: the conditioner's logits for them are 0, which leaves the predictor's logits
+    unchanged.
 
     Args:
         codec: the factors.
         mask: the next factors that are inputs of a group.
-        group_size: hidden nodes G in a group (the paper: 2d, of 2d^2 + 1 in all).
+        group_size: number of hidden nodes G in a group (the paper: 2d, out of 2d^2 + 1 in total).
         activation: of the hidden nodes.
-        correction: whether outputs are added to the predictor's logits, and thus start at zero; False: they are used alone
-            (the paper).
+        correction: True: outputs are added to the predictor's logits, and are zero before training; False: outputs are used
+            alone (the paper).
         dropout: share of hidden nodes zeroed in each training step.
-        grouped: bool [O], outputs that have a group; None: all. Requires ``correction``.
+        grouped: bool [O], which outputs have a group; None: all. Ignored unless ``correction`` is True.
         generator: source of the initial weights.
     """
 
@@ -326,7 +329,7 @@ class Conditioner(nn.Module):
 
 
 def group_mask(codec: FactorCodec, mask: Mask, group_size: int, outputs: Tensor) -> Tensor:
-    """Mask of the inputs of each hidden node in the groups of ``outputs``, bool [groups * group_size, n_inputs + n_columns]."""
+    """Input mask of each hidden node in the groups of ``outputs``, bool [groups * group_size, n_inputs + n_columns]."""
     own = outputs[:, None]
     seen = codec.column_factor < own if mask == "causal" else codec.column_factor != own
     everything = torch.ones(len(outputs), codec.n_inputs, dtype=torch.bool)
@@ -334,7 +337,7 @@ def group_mask(codec: FactorCodec, mask: Mask, group_size: int, outputs: Tensor)
 
 
 def uniform(shape: Sequence[int], bound: float, generator: torch.Generator) -> Tensor:
-    """Numbers uniform in [-bound, bound), drawn from ``generator``."""
+    """Uniform random numbers in [-bound, bound), drawn from ``generator``."""
     return (torch.rand(tuple(shape), generator=generator) * 2.0 - 1.0) * bound
 
 
@@ -410,7 +413,7 @@ def logits_of(planes: Tensor, end: Tensor, layout: PlaneLayout, codec: FactorCod
 
 
 class Convolution(nn.Module):
-    """``nn.Conv2d`` that keeps the size and draws its initial weights from a given generator."""
+    """``nn.Conv2d`` that preserves height and width and draws its initial weights from a given generator."""
 
     def __init__(self, n_in: int, n_out: int, size: int, generator: torch.Generator) -> None:
         super().__init__()
@@ -429,11 +432,11 @@ def maximum(planes: Tensor) -> Tensor:
 
 
 class PlaneStringPredictor(nn.Module):
-    """Features of each cell, updated by one residual block for each action, with one output layer at the end.
+    """Computes features of each cell, updates them by one residual block per action, and applies one output layer at the end.
 
-    A receptive field of two cells in each direction is too small for predictions over many steps. Here a block (two 3x3
-    convolutions and a global maximum, with the same weights for every action of the string) is applied once per action,
-    so the receptive field grows with the length of the string, while the number of weights does not.
+    A receptive field of two cells in each direction is too small for predictions over many steps. Here, a block of two 3x3
+    convolutions and a global maximum is applied once per action of the string, always with the same weights. So the receptive
+    field grows with the length of the string, while the number of weights does not.
 
     Args:
         codec: the factors, one for each cell; its ``n_steps`` is the length of the string.

@@ -1,14 +1,15 @@
 """Pruning of predictor and conditioner, and the dependencies between variables that remain.
 
-Pruning is by magnitude with retraining (paper section 5), then by the extended BIC: some of the weights that remain after pruning
-by magnitude only fit noise, as a fair coin keeps dozens of weak parents. A connection is kept only if its removal increases the
-loss on the observed transitions, in nats, by more than half the logarithm of their number (Schwarz 1978, "Estimating the
-dimension of a model") plus the logarithm of the number of candidate inputs, since the best of many gains is large by chance (Chen
-and Chen 2008, "Extended Bayesian information criteria for model selection with large model spaces"). Each connection is tested
-with the rest of the network fixed; its mean contribution is added to the bias.
+Pruning is first by magnitude with retraining (paper section 5), then by the extended BIC, because some of the weights left by
+magnitude pruning only fit noise: a fair coin, for example, keeps dozens of weak parents. A connection is kept only if its
+removal increases the total loss on the observed transitions, in nats, by at least the sum of two terms. The first is half the
+logarithm of the number of transitions (Schwarz 1978, "Estimating the dimension of a model"). The second is the logarithm of the
+number of candidate inputs, since the best of many gains is large by chance (Chen and Chen 2008, "Extended Bayesian information
+criteria for model selection with large model spaces"). Each connection is tested with the rest of the network fixed, except that
+the mean contribution of the connection is added to the bias.
 
 "If we can find that some sets of variables are conditionally independent of one another, we can separate them into different
-modules" (paper section 5, figures 11 and 12): influences and variable groups follow from the remaining connections.
+modules" (paper section 5, figures 11 and 12). Influences and variable groups are computed from the remaining connections.
 Shapes: N rows, C output columns of a network, H hidden nodes, I inputs, F state factors, O = F + 1 output factors (``terminated``
 last), A actions.
 """
@@ -37,13 +38,13 @@ from mbagent.types import Floats, Ints, Progress
 
 @dataclass(frozen=True)
 class Influence:
-    """Sums of absolute weights over all paths to each output factor; 0 if there is no path.
+    """Influence on each output factor: product of absolute weights along a path, summed over all paths; 0 without a path.
 
     Attributes:
-        states: from each state factor, in the predictor, [O, F].
-        actions: from each action, in the predictor, [O, A].
-        others: from each other output factor, in the conditioner, [O, O].
-        conditions: from each state factor, in the conditioner, [O, F].
+        states: influence of each state factor in the predictor, [O, F].
+        actions: influence of each action in the predictor, [O, A].
+        others: influence of each other output factor in the conditioner, [O, O].
+        conditions: influence of each state factor in the conditioner, [O, F].
     """
 
     states: Floats
@@ -58,8 +59,8 @@ class VariableGroup:
 
     Attributes:
         outputs: output factors, int64.
-        inputs: state factors with a path to them, int64.
-        action: whether the action has a path to them.
+        inputs: state factors with a path to these outputs, int64.
+        action: whether the action has a path to them in the predictor.
     """
 
     outputs: Ints
@@ -74,15 +75,15 @@ class VariableGroup:
 
 
 def influence(model: NetworkPair, *, effective: bool = False) -> Influence:
-    """The sums over paths of both networks.
+    """Computes the sums over paths in both networks.
 
     Args:
         model: the networks.
-        effective: whether to omit, in a pruned model of bits, dependencies without effect, such as paths that cancel each other
-            (see ``truth_tables.find_parents``).
+        effective: whether to omit dependencies without effect, such as paths that cancel each other; this applies only to a
+            pruned model of bits (see ``truth_tables.find_parents``).
 
     Raises:
-        ValueError: the predictor is not a dense one: weights shared over positions have no variables of their own.
+        ValueError: the predictor is not dense; weights shared over positions do not belong to single variables.
     """
     if not isinstance(model.predictor, DensePredictor):
         raise ValueError("Sums over paths need networks on flat variables; this model shares its weights over positions.")
@@ -137,12 +138,12 @@ def modules(found: Influence) -> list[VariableGroup]:
 
 
 def dependent_groups(found: Influence) -> list[VariableGroup]:
-    """Groups of variables that the conditioner links to each other given state and action; largest first."""
+    """Groups of variables whose next values the conditioner links, given state and action; largest first."""
     return _modules(found, found.others > 0.0)
 
 
 def _modules(found: Influence, links: NDArray[np.bool_]) -> list[VariableGroup]:
-    """The connected components of more than one variable, or of one that depends on itself."""
+    """Connected components with several variables, or with one that depends on itself."""
     _, label = connected_components(csr_matrix(links.astype(np.int64)), directed=False)
     result = []
     for component in range(label.max() + 1):
@@ -178,7 +179,7 @@ class Judge:
         self.price = (0.5 * math.log(max(n_transitions, 2)) + math.log(max(n_candidates, 1))) / max(n_transitions, 1)
 
     def _nats(self, factor: int, logits: Tensor) -> float:
-        """Mean loss of a factor whose columns have the ``logits`` [N, its columns]."""
+        """Mean loss of a factor, given its columns' ``logits`` [N, its columns]."""
         outcome = self.outcomes[:, factor]
         if logits.shape[1] == 1:
             losses = functional.softplus(logits[:, 0]) - logits[:, 0] * outcome
@@ -244,7 +245,7 @@ class Layers:
         return self._left() < before
 
     def trim_past(self, i: int, paths: Tensor, weight: Tensor, judge: Judge) -> bool:
-        """Removes all paths from input i to column i, direct or through nodes, at once, as they may cancel each other.
+        """Removes all paths, direct or through nodes, from input i to column i at once, as they may cancel out.
 
         Args:
             i: index of the input and of the column.
@@ -301,7 +302,7 @@ def trim_layer(inputs: Tensor, weight: Tensor, bias: Tensor, columns: Tensor, ju
 
 
 def _weakest_first(weights: Tensor, spread: Tensor) -> list[int]:
-    """Indices of the non-zero weights, by the standard deviation of their contribution."""
+    """Indices of non-zero weights, sorted by the standard deviation of their effect."""
     places: list[int] = torch.nonzero(weights)[:, 0].tolist()
     sizes = (weights.abs() * spread).tolist()
     return sorted(places, key=sizes.__getitem__)
@@ -396,7 +397,7 @@ def prune_networks(
     Args:
         trainer: trainer of the networks.
         connections: connections of "predictor" and, if there is one, "conditioner".
-        fraction: smallest share of each network's connections to be removed.
+        fraction: minimum share of each network's connections to remove.
         train: training examples.
         held_out: examples for the selection of the best weights.
         n_transitions: number of transitions that the training examples represent.

@@ -1,14 +1,14 @@
 """Compiled sampling from predictor and conditioner (paper 3.1 and 3.2); every row uses its own key.
 
 Three samplers: each factor independently (no conditioner), ancestral (conditioner masked to y_<i; exact), and the paper's sweeps
-(conditioner masked to all but y_i; in ``gibbs.py``). For planning, successors are listed if they are few; otherwise they are
-obtained by systematic sampling. Main particles contain the grid points (j + offset) / n of [0, 1). At each factor a particle's
+(conditioner masked to all but y_i; in ``gibbs.py``). For planning, all successors are listed if there are few; otherwise
+systematic sampling is used. Main particles contain the grid points (j + offset) / n of [0, 1). At each factor a particle's
 interval is split in proportion to P(y_i | s, a, y_<i) and its points are distributed to the parts; parts without a point are
-dropped. So the work grows with the number of distinct outcomes and not with n. The offset is the same for all rows, so that
-actions or states differ only by their effects. A particle with a single point continues with new random numbers, hashed from
-(seed, point, factor), since its interval would soon be too narrow for a float.
-Shapes: B batch, F state factors, O = F + 1 output factors, K largest cardinality, n points per row, M successors. Rows of arrays
-are addressed by index, not sliced, since creating a slice takes longer than the work done with it here.
+dropped. So the work grows with the number of distinct outcomes, not with n. All rows share the offset, so actions or states
+differ only in their effects, not by chance. A particle with a single point continues with new random numbers, hashed from (seed,
+point, factor), since its interval would soon be too narrow for a float.
+Shapes: B batch, F state factors, O = F + 1 output factors, K largest cardinality, n points per row, M successors. Array rows are
+indexed, not sliced, since creating a slice would take longer than the work done on it here.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Work(NamedTuple):
     """Work space for one row.
 
     Attributes:
-        columns: columns that are 1, int64 [2 * O + n_steps].
+        columns: indices of ones, int64 [2 * O + n_steps].
         noise: random number of each factor, [O].
         sums: input of one group, [1, G].
         row_logits: logits of one factor, [K].
@@ -136,9 +136,8 @@ def sample_causal(
 ) -> Ints:
     """Ancestral samples int64 [B, O]: y_0, then y_1 given y_0, and so on; ``greedy`` takes the most likely values instead.
 
-    A factor whose most likely value has at least the probability ``certain`` by the predictor, or that has no group in the
-    conditioner, is sampled from the predictor. This is part of the model: ``log_prob_causal`` follows the same rule, so
-    both are exact.
+    A factor is sampled from the predictor if its most likely value has predicted probability at least ``certain``, or if it has
+    no group in the conditioner. This is part of the model: ``log_prob_causal`` follows the same rule, so both are exact.
 
     Args:
         states: int64 [B, F].
@@ -327,7 +326,7 @@ def _causal(
 def _known_input(
     i: int, base: Ints, active: Ints, n_active: int, layout: Layout, group: GroupWeights, columns: Ints, sums: Floats32
 ) -> None:
-    """Writes to ``sums[0]`` the input of factor i's group that all particles of a row share: from (s, a) and settled factors."""
+    """Writes to ``sums[0]`` the input to factor i's group that a row's particles share, from (s, a) and settled factors."""
     g, n = group.group_of[i], 0
     for j in range(i):
         if base[j] >= 0 and (layout.outputs[j] != 2 or base[j] == 1):

@@ -30,13 +30,13 @@ class TrainingConfig:
     """How networks are fitted.
 
     Attributes:
-        learning_rate: AdamW's largest, at a third of the one-cycle schedule.
+        learning_rate: AdamW's peak, a third into the one-cycle schedule.
         weight_decay: AdamW's.
-        memory: AdamW's second beta, the decay rate of squared gradients; a smaller one makes large rates safe.
-        batch_size: rows of a gradient step.
+        memory: AdamW's beta2, the decay rate of squared gradients; lower makes large learning rates safe.
+        batch_size: rows per gradient step.
         epochs: passes over the distinct rows, subject to the bounds on steps.
-        min_steps: smallest number of gradient steps.
-        max_steps: largest number of gradient steps.
+        min_steps: minimum number of gradient steps.
+        max_steps: maximum number of gradient steps.
         validation: share of episodes held out.
         checks: number of evaluations of the held-out loss; the weights with the lowest loss are kept.
         patience: stop after this many checks without a better held-out loss.
@@ -73,11 +73,11 @@ class NeuralConfig:
             independent given state and action).
         group_size: hidden nodes in each of the conditioner's groups.
         correction: whether the conditioner's output is added to the predictor's logits.
-        certain: a factor whose most likely value has at least this probability by the predictor is sampled from the predictor;
-            in sweeps the conditioner is evaluated for it only if the random number is extreme (``gibbs.LEEWAY``).
+        certain: a factor whose most likely value has at least this predicted probability is sampled from the predictor; sweeps
+            evaluate the conditioner for it only if the random number is extreme (``gibbs.LEEWAY``).
         dropout: share of hidden nodes zeroed in each training step; without it, networks fit the noise of rare
-            states. None: 0.4, or 0 if the state is a single factor: then states share no features, the network is in effect a
-            table, and dropout only adds noise.
+            states. None: 0.4, or 0 for single-factor states, which share no features: the network is then in effect a table, and
+            dropout only adds noise.
         sweeps: passes over all factors, with mask "others".
         real_guess: whether sweeps start from the predictor's probabilities rather than from bits drawn from them.
         training: see TrainingConfig.
@@ -96,7 +96,7 @@ class NeuralConfig:
     training: TrainingConfig = field(default_factory=TrainingConfig)
 
     def dropout_for(self, n_factors: int) -> float:
-        """The share of dropout for states of ``n_factors`` factors."""
+        """The dropout rate for states of ``n_factors`` factors."""
         if self.dropout is not None:
             return self.dropout
         return 0.4 if n_factors > 1 else 0.0
@@ -142,7 +142,7 @@ class Examples:
         return Examples(self.states[rows], self.actions[rows], self.outcomes[rows], self.weights[rows])
 
     def spread(self, most: int) -> Examples:
-        """At most ``most`` rows, evenly spaced, since distinct rows are sorted and neighbours are similar."""
+        """At most ``most`` rows, evenly spaced, since rows are sorted, so neighbours are similar."""
         return self.select(torch.linspace(0, len(self) - 1, min(len(self), most)).long()) if len(self) else self
 
 
@@ -188,7 +188,7 @@ def losses(codec: FactorCodec, logits: Tensor, outcomes: Tensor, loss: Loss) -> 
 
 
 class Trainer:
-    """Fits a predictor and then a conditioner to examples, or both to single observations in turn.
+    """Fits a predictor, then a conditioner, to examples; or both to one observation at a time.
 
     The conditioner's loss has no gradient with respect to the predictor, which can therefore be fitted first; the conditioner
     then corrects a fixed predictor.
@@ -234,7 +234,7 @@ class Trainer:
         progress: Progress | None,
         shrinking: Shrinking | None = None,
     ) -> float:
-        """Fits the predictor, with its best weights at the end; returns the epochs. ``shrinking`` prunes it during training."""
+        """Fits the predictor and keeps its best weights; returns the epochs. ``shrinking`` prunes it during training."""
         return self._run(self.predictor, self.predictor_losses, train, held_out, generator, progress, shrinking)
 
     def fit_conditioner(
@@ -245,7 +245,7 @@ class Trainer:
         progress: Progress | None,
         shrinking: Shrinking | None = None,
     ) -> float:
-        """Fits the conditioner, if any factor needs it, with its best weights at the end; returns the epochs."""
+        """Fits the conditioner, if any factor needs it, and keeps its best weights; returns the epochs."""
         if self.conditioner is None or len(self.conditioner.members) == 0:
             return 0.0
         return self._run(self.conditioner, self.conditioner_losses, train, held_out, generator, progress, shrinking)
@@ -379,7 +379,7 @@ def batches(rows: Examples, size: int, n_steps: int, generator: torch.Generator)
 
 
 def one_cycle(t: float, peak: float = 0.3, start: float = 0.04) -> float:
-    """Share of the largest learning rate at share ``t`` of training: a cosine from ``start`` to 1 at ``peak``, then to 1e-4.
+    """Learning rate relative to its peak, at share ``t`` of training: cosine from ``start`` to 1 at ``peak``, then to 1e-4.
 
     Smith and Topin 2017, "Super-convergence".
     """

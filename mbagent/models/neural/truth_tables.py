@@ -1,9 +1,9 @@
 """Truth tables of pruned networks of bits.
 
-Each outcome bit has a table over the few bits on which it still depends, of the state and of earlier outcome bits; a sample is
-one look-up. The parents of a bit are the inputs connected to it by some path whose effect exceeds a tolerance; all other inputs
-are fixed to their modes, and the resulting error is measured on transitions. Networks of which some bit has too many parents
-for a table have none.
+Each outcome bit has a table over the few state bits and earlier outcome bits on which it still depends; a sample is one look-up.
+The parents of a bit are the inputs connected to it by some path whose effect exceeds a tolerance; all other inputs are fixed to
+their modes, and the resulting error is measured on transitions. If any bit has too many parents for a table, no tables are
+built.
 Shapes: F bits of a state, O = F + 1 of an outcome (``terminated`` last), A actions.
 """
 
@@ -56,7 +56,7 @@ Marks = NDArray[np.int8]
 
 
 class Pair(NamedTuple):
-    """The two networks, and the probability ``certain`` from which on the predictor is trusted."""
+    """The two networks, and the probability ``certain`` from which the predictor is trusted."""
 
     predictor: DensePredictor
     conditioner: Conditioner | None
@@ -211,7 +211,7 @@ class Table(NamedTuple):
     Attributes:
         states: parents among the bits of the state, in order.
         others: parents among the bits of the outcome, in order.
-        chances: P(bit = 1): [1 or A, 2, ..., 2], an axis for the action, and one for each of these bits, the last one first.
+        chances: P(bit = 1), [1 or A, 2, ..., 2]: an axis for the action, then one for each of these bits, in reverse.
     """
 
     states: tuple[int, ...]
@@ -233,7 +233,7 @@ class Table(NamedTuple):
 
 
 def compile_rules(tables: Sequence[Table], n_actions: int, settled: bool = False) -> BitRules:
-    """Combines the tables, one for each outcome bit, to rules.
+    """Combines the tables, one per outcome bit, into rules.
 
     Args:
         tables: the tables; probabilities close to 0 or 1 are rounded.
@@ -277,7 +277,7 @@ def _by_state(r: int, action: int, state: Ints, bits: Ints, parents: Ints) -> tu
 
 @inlined
 def settled_chance(one: float) -> float:
-    """Probability ``one`` of a bit, pruned as by ``systematic_sampling.prune``."""
+    """A bit's probability ``one``, pruned as in ``systematic_sampling.prune``."""
     if one < NEGLIGIBLE * (1.0 - one):
         return 0.0
     if 1.0 - one < NEGLIGIBLE * one:
@@ -287,7 +287,7 @@ def settled_chance(one: float) -> float:
 
 @compiled
 def sample_rules(states: Ints, actions: Ints, keys: Keys, rules: BitRules) -> tuple[Ints, NDArray[np.bool_]]:
-    """Samples next states int64 [B, F] and ``terminated`` bool [B]: bit i of row b uses number i of key b, as in ``sampling``."""
+    """Samples next states int64 [B, F], ``terminated`` bool [B]: bit i of row b uses key b's ith number, as in ``sampling``."""
     n_bits, table, bits, parents, copies = states.shape[1], rules.table, rules.bits, rules.parents, rules.copies
     drawn, ended = np.empty_like(states), np.zeros(len(states), dtype=np.bool_)
     outcome = np.zeros(n_bits + 1, dtype=np.int64)
@@ -327,7 +327,7 @@ class RulesWork(Struct):
 
 @inlined
 def _by_outcome(q: int, place: int, weight: int, v: int, end: int, parents: Ints, base: Ints, slot: Ints, factors: Ints) -> int:
-    """Adds the values of parents ``v:end`` in particle q to the index ``place``, the first one with stride ``weight``."""
+    """Adds the values of parents ``v:end`` in particle q to index ``place``; the first has stride ``weight``."""
     while v < end:
         value = base[parents[v]]
         if value < 0:
@@ -399,7 +399,7 @@ class BitRules(Struct):
         bits: a row for each outcome bit that is not a copy, in order, int64 [R, 6]: the bit; the start of its table; the offset
             of the next action's table; the start of its parents in the state, their start in the outcome, and their end.
         parents: parents of all tables, int64.
-        copies: a row for each other bit, int64 [O - R, 4]: the bit; a bit of the state; its value if that bit is 0; if it is 1.
+        copies: a row for each other bit, int64 [O - R, 4]: the bit; a state bit; the bit's value if that is 0; and if 1.
         n_actions: A.
     """
 

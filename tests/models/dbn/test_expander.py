@@ -8,7 +8,6 @@ from gymnasium import spaces
 
 from mbagent.models.dbn import DecisionGraphModel
 from mbagent.models.dbn.affected_variables import AffectedIndex
-from mbagent.models.dbn.successors import WholeKernel
 from mbagent.models.mdp import StateGraph
 from mbagent.models.registry import build_model
 from mbagent.planning.lookahead import grow_lookahead
@@ -96,7 +95,7 @@ def test_compiled_expansion_equals_the_successors(name: str) -> None:
     model, states = WORLDS[name]()
     roots = np.unique(states[::7], axis=0)[:60]
     compiled, plain = StateGraph(model), StateGraph(model)
-    assert isinstance(compiled.kernel, AffectedIndex | WholeKernel)
+    assert compiled.kernel is not None
     plain.kernel = None
     groups = np.zeros(len(roots), dtype=np.int64)
     for draws in (1, 4, 16):

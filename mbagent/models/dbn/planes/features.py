@@ -1,7 +1,8 @@
-"""Features of cells of planes: their neighbourhood, the border, the action, and which values are adjacent anywhere.
+"""Features of the cells of planes: neighbourhood, border, action, and which values are adjacent anywhere on the board.
 
-Features are relative to the cell, so that parameters are tied over all positions (compare similar modules in the paper's section
-5). Grounding leads from graphs with relative features, one set for each channel, to graphs of every cell of a board of any size.
+Features are relative to the cell, so that parameters are tied over all positions (compare the similar modules in section 5 of
+the paper). Grounding turns the graphs of each channel, which test relative features, into graphs of every cell of a board of any
+size.
 Shapes: N transitions, C channels, P positions, D relative features.
 """
 
@@ -42,8 +43,8 @@ class Reach(NamedTuple):
     """Extent of a neighbourhood.
 
     Attributes:
-        radius: rows and columns in each direction.
-        wrap: whether it continues at the opposite side of the board.
+        radius: number of rows and columns in each direction.
+        wrap: whether the neighbourhood continues at the opposite side of the board.
     """
 
     radius: int = 1
@@ -58,7 +59,7 @@ NEXT_RADIUS = 2
 
 
 def relative_features(cardinalities: Sequence[int], parts: Sequence[int], reach: Reach) -> Ints:
-    """All relative features, int64 [D, 7]; see CELL.
+    """All relative features, int64 [D, 7]; for the columns, see CELL.
 
     Args:
         cardinalities: number of values of each channel's cells, length C.
@@ -82,7 +83,7 @@ def relative_features(cardinalities: Sequence[int], parts: Sequence[int], reach:
 
 
 def _adjacencies(shown: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int, int, int, int, int]]:
-    """Pairs of values in one cell or in neighbouring cells (diagonally, too), and values at each of the four borders."""
+    """Pairs of values in one cell or in neighbouring cells (including diagonals), and values at each of the four borders."""
     for i, first in enumerate(shown):
         for second in shown[i:]:
             for dy, dx in itertools.product((-1, 0, 1), (-1, 0, 1)):
@@ -93,10 +94,10 @@ def _adjacencies(shown: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int, i
 
 
 def informative_features(features: Ints, before: Factors, after: Factors) -> Ints:
-    """Numbers of the relative features that can be informative, given the observed planes.
+    """Indices of the relative features that can be informative, given the observed planes.
 
-    Features of values that never occurred are left out, as are adjacencies of channels that only repeat another channel's
-    previous state, or that are uniform over the board; of a uniform channel, one cell is enough.
+    Left out are features of values that never occurred, and adjacencies of channels that only repeat another channel's previous
+    state or are uniform over the board. For a uniform channel, only features of the cell at offset (0, 0) are kept.
 
     Args:
         features: int64 [D, 7].
@@ -124,7 +125,7 @@ def informative_features(features: Ints, before: Factors, after: Factors) -> Int
 
 
 def _values(plane: Factors) -> set[int]:
-    """Values of a plane [N, H, W]; testing the few values is faster than sorting all cells."""
+    """Values that occur in a plane [N, H, W]; testing each possible value is faster than sorting all cells."""
     return {value for value in range(int(plane.max(initial=0)) + 1) if (plane == value).any()}
 
 
@@ -134,18 +135,18 @@ def _repeats(after: Factors, before: Factors) -> bool:
 
 
 def determined_by(channel: int, features: Ints, numbers: Ints, before: Factors, after: Factors, actions: Ints) -> Ints | None:
-    """Numbers of the features that alone determine a channel everywhere: another channel's current values, or an action.
+    """Indices of features that fully determine a channel's next values: another channel's current values, or an action.
 
     Args:
         channel: the channel.
         features: int64 [D, 7].
-        numbers: candidate features, int64 [K].
+        numbers: indices of the candidate features, int64 [K].
         before: planes, int [N, C, H, W].
         after: those of the next states.
         actions: int64 [N].
 
     Returns:
-        Numbers, or None if no other channel or action determines the channel.
+        Indices, or None if no other channel and no action determines the channel.
     """
     here = numbers[(features[numbers, 0] == CELL) & (features[numbers, 3:5] == 0).all(axis=1)]
     for other in np.unique(features[here, 1]):
@@ -160,7 +161,7 @@ def determined_by(channel: int, features: Ints, numbers: Ints, before: Factors, 
 
 
 def feature_values(features: Ints, planes: Factors, actions: Ints, after: Factors | None = None) -> Bools:
-    """Relative features of every transition and position, bool [N * P, D]; positions of a transition are contiguous.
+    """Values of the relative features at each position of each transition, bool [N * P, D], transition by transition.
 
     Args:
         features: relative features, int64 [D, 7].
@@ -172,7 +173,7 @@ def feature_values(features: Ints, planes: Factors, actions: Ints, after: Factor
 
 
 def feature_planes(features: Ints, planes: Factors, actions: Ints, after: Factors | None = None) -> Bools:
-    """As ``feature_values``, one feature after another, bool [D, N, H, W]."""
+    """As ``feature_values``, but with the features as the first axis, bool [D, N, H, W]."""
     n, _, height, width = planes.shape
     table = np.empty((len(features), n, height, width), dtype=np.bool_)
     inside = np.ones((height, width), dtype=np.bool_)
@@ -190,15 +191,15 @@ def feature_planes(features: Ints, planes: Factors, actions: Ints, after: Factor
 
 
 def values_at(features: Ints, planes: Factors, actions: Ints, rows: Ints, y: Ints, x: Ints) -> Bools:
-    """As ``feature_values``, of some positions of some transitions only, bool [K, D].
+    """As ``feature_values``, but only for K given (transition, position) pairs, bool [K, D].
 
     Args:
         features: relative features of the current state, int64 [D, 7].
         planes: int [N, C, H, W].
         actions: int64 [N].
-        rows: transition of each, int64 [K].
-        y: row of its position, int64 [K].
-        x: column of its position, int64 [K].
+        rows: transition of each pair, int64 [K].
+        y: row of each position, int64 [K].
+        x: column of each position, int64 [K].
     """
     table = np.zeros((len(rows), len(features)), dtype=np.bool_)
     order = np.argsort(rows, kind="stable")
@@ -215,7 +216,7 @@ def values_at(features: Ints, planes: Factors, actions: Ints, rows: Ints, y: Int
 
 @compiled
 def _local_values(features: Ints, planes: Ints, rows: Ints, y: Ints, x: Ints, out: Bools) -> None:
-    """The features of ``values_at`` that depend on the position."""
+    """Writes the features of ``values_at`` that depend on the position to ``out``."""
     _, _, height, width = planes.shape
     for k in range(len(rows)):
         for d in range(len(features)):
@@ -246,13 +247,13 @@ def _action_is(feature: Ints, actions: Ints) -> Bools:
 
 
 def far_value(feature: Ints, planes: Factors, actions: Ints, after: Factors | None) -> Bools:
-    """As ``feature_values``, for a feature that is the same at all positions, bool [N]."""
+    """As ``feature_values``, for one feature whose value is the same at all positions, bool [N]."""
     kind = int(feature[0])
     return _action_is(feature, actions) if kind == ACTION else are_adjacent(_shown(kind, planes, after), feature[1:])
 
 
 def shifted(plane: NDArray[_Cell], below: int, right: int) -> NDArray[_Cell]:
-    """Value at a fixed offset (rows below, columns to the right) from each position of [N, H, W]; 0 beyond the border."""
+    """Values [N, H, W] at a fixed offset (rows below, columns to the right) from each position; 0 beyond the border."""
     _, height, width = plane.shape
     result = np.zeros_like(plane)
     rows, cols = slice(max(0, -below), min(height, height - below)), slice(max(0, -right), min(width, width - right))
@@ -263,14 +264,14 @@ def shifted(plane: NDArray[_Cell], below: int, right: int) -> NDArray[_Cell]:
 
 
 def wrapped(plane: NDArray[_Cell], below: int, right: int) -> NDArray[_Cell]:
-    """Value at a fixed offset from each position of [N, H, W] with wrap-around; 0 if the offset stays within the border."""
+    """Values [N, H, W] at a fixed offset from each position, with wrap-around; 0 where the offset stays within the border."""
     around = np.roll(plane, (-below, -right), axis=(1, 2))
     inside = shifted(np.ones((1, *plane.shape[1:]), dtype=np.bool_), below, right)
     return np.where(inside, np.zeros_like(around), around)
 
 
 def are_adjacent(planes: Factors, adjacency: Ints) -> Bools:
-    """Whether, anywhere, one channel has a value and the other has its value at the adjacency's offset, bool [N]."""
+    """Whether the adjacency holds anywhere: one channel has its value, and the other has its own at the offset, bool [N]."""
     first, value, second, other, below, right = (int(part) for part in adjacency)
     inside = np.ones((1, *planes.shape[2:]), dtype=np.bool_)
     there = ~shifted(inside, below, right) if second == BEYOND else shifted(planes[:, second] == other, below, right)
@@ -279,7 +280,7 @@ def are_adjacent(planes: Factors, adjacency: Ints) -> Bools:
 
 
 def feature_kinds(features: Ints) -> Ints:
-    """Kind of each relative feature, int64 [D]: a channel's cells (now, next), border, action, adjacency (now, next)."""
+    """Kind of each relative feature, int64 [D]: cells of each channel (now, next), border, action, adjacency (now, next)."""
     kind = features[:, 0]
     n_channels = int(features[kind == CELL, 1].max(initial=0)) + 1
     of_channel = np.isin(kind, (CELL, NEXT, WRAP))
@@ -311,13 +312,14 @@ WHOLE, ROW, COLUMN = 0, 1, 2
 
 
 class Mutex(NamedTuple):
-    """Cells of a channel of which at most one is on after a step.
+    """A group of cells of one channel; at most one of them is on after a step.
 
     Attributes:
         channel: the channel, of bits.
         kind: WHOLE, ROW or COLUMN.
-        line: number of the row or column, from the top or left; if it is nearer to the other end, counted from there, -1 first.
-        exactly: whether exactly one is on.
+        line: index of the row or column from the top or left; if the bottom or right is nearer, a negative index from there (-1
+            is the last line).
+        exactly: whether exactly one cell is on.
     """
 
     channel: int
@@ -326,12 +328,12 @@ class Mutex(NamedTuple):
     exactly: bool
 
     def lies_on(self, height: int, width: int) -> bool:
-        """Whether a board has this line."""
+        """Whether a board of this size has the line."""
         length = {WHOLE: 1, ROW: height, COLUMN: width}[self.kind]
         return -length <= self.line < length
 
     def cells(self) -> tuple[slice | int, slice | int]:
-        """Indices of its rows and columns."""
+        """Row and column indices of the cells."""
         rows = self.line if self.kind == ROW else slice(None)
         cols = self.line if self.kind == COLUMN else slice(None)
         return rows, cols
@@ -343,11 +345,11 @@ class LocalGraphs:
 
     Attributes:
         graphs: variables are the channels, then ``terminated`` and the reset; features are relative.
-        synchronic: graphs of channels whose cells have synchronic arcs; cells are drawn from the upper left on, channel after
-            channel.
+        synchronic: graphs of the channels whose cells have synchronic arcs; cells are drawn channel by channel, row by row from
+            the upper left.
         features: the relative features, int64 [D, 7], see ``features.py``.
         cardinalities: number of values of each channel's cells, length C.
-        encoding: the actions.
+        encoding: the action encoding.
         mutexes: mutex groups of cells.
         invariants: properties that every transition preserves.
     """
@@ -401,7 +403,7 @@ def with_mutexes(layout: Layout, mutexes: Sequence[Mutex]) -> Layout:
 
 
 class _Board:
-    """Graphs of all cells while they are built. A cell's variable has the number of its factor."""
+    """Graphs of all cells, under construction. The index of a cell's variable is that of its factor."""
 
     def __init__(self, local: LocalGraphs, layout: Layout, adjacencies: dict[int, int]) -> None:
         self.local, self.layout, self.relative = local, layout, local.graphs
@@ -465,7 +467,7 @@ class _Board:
         return sorted(found)
 
     def _copy(self, nodes: Sequence[int], shared: dict[int, int], y: int, x: int) -> dict[int, int]:
-        """Nodes for a position; tests whose result the border determines are resolved."""
+        """The node at a position for each relative node; tests whose result the border determines are resolved."""
         graphs, copies = self.relative, dict(shared)
         for node in nodes:
             relative, off, on = graphs.node[node].tolist()
@@ -474,7 +476,7 @@ class _Board:
         return copies
 
     def _absolute(self, relative: int, y: int, x: int) -> int:
-        """Number of a relative feature at a position among the features of the board, or ``_NEVER`` or ``_ALWAYS``."""
+        """Index, among the board's features, of a relative feature at a position; or ``_NEVER`` or ``_ALWAYS``."""
         _, height, width = self.layout.cells.shape
         kind, *parts = self.features[relative]
         if kind == ACTION:

@@ -1,4 +1,4 @@
-"""Invariants of planes: counts of values that never change, and combinations of channel values that occur in a cell.
+"""Invariants of planes: constant counts of values, and the combinations of channel values that occur in a cell.
 
 Graphs draw cell after cell and channel after channel, so an object that moves at random may be drawn in two places or in none, or
 without its colour. If the number of cells with a value was the same before and after every transition, or if only some
@@ -44,7 +44,7 @@ class Invariants(NamedTuple):
     """Invariants of all transitions.
 
     Attributes:
-        counts: (channel, value) pairs whose number of cells never changes, int64 [K, 2].
+        counts: (channel, value) pairs; the number of cells with this value never changes, int64 [K, 2].
         observed: which combinations of the channels' values occur in a cell, bool [P]; empty if any may occur.
     """
 
@@ -61,7 +61,7 @@ NO_INVARIANTS = Invariants(np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=n
 
 
 def radix(cardinalities: Sequence[int]) -> Ints:
-    """Weight of each channel's value in the number of a combination, int64 [C]."""
+    """Weight of each channel's value in the index of a combination of values, int64 [C]."""
     result: Ints = np.cumprod([1, *cardinalities], dtype=np.int64)[:-1]
     return result
 
@@ -102,9 +102,10 @@ def _find_counts(rows: TransitionBatch, board: PlaneLayout, cardinalities: Seque
 
 
 def _find_observed(rows: TransitionBatch, board: PlaneLayout, cardinalities: Sequence[int]) -> Bools:
-    """Observed combinations; empty if any may occur, or if new ones are still being observed.
+    """Which combinations were observed, bool [P]; empty if any may occur, or if new ones are still being observed.
 
-    The probability that the next state has a new one is estimated from those observed in only one state (Good 1953).
+    The probability of a new combination in the next state is estimated from the number of combinations observed in exactly one
+    state (Good 1953).
     """
     size, weights = n_combinations(cardinalities), radix(cardinalities)
     if size == 0 or len(cardinalities) < 2 or len(rows) == 0:
@@ -132,7 +133,7 @@ def has_invariants(layout: Layout) -> bool:
 
 @compiled
 def keeps(layout: Layout, state: Ints, following: Ints) -> bool:
-    """Whether a next state [F] satisfies all invariants; its counts must be those of the current state."""
+    """Whether a next state [F] satisfies all invariants; its counts must equal those of the current state."""
     counts, observed, cells = layout.counts, layout.observed, layout.cells
     n_channels, height, width = cells.shape
     for k in range(len(counts)):
@@ -155,7 +156,7 @@ def keeps(layout: Layout, state: Ints, following: Ints) -> bool:
 
 @compiled
 def all_kept(layout: Layout, states: Ints, following: Ints) -> Bools:
-    """``keeps`` for rows, bool [B]."""
+    """``keeps`` for each row, bool [B]."""
     result = np.empty(len(states), dtype=np.bool_)
     for b in range(len(states)):
         result[b] = keeps(layout, states[b], following[b])
@@ -164,10 +165,10 @@ def all_kept(layout: Layout, states: Ints, following: Ints) -> Bools:
 
 @compiled
 def leave_out(layout: Layout, state: Ints, first: int, n: int, out: Outcomes) -> int:
-    """Removes non-terminal outcomes among ``first`` to ``first + n`` that violate an invariant; returns how many are left.
+    """Of the ``n`` outcomes from ``first`` on, removes non-terminal ones that violate an invariant; returns how many are left.
 
-    Works in place. The other non-terminal outcomes are renormalised. If these have less than ``RARE_VALUE`` of the non-terminal
-    probability, nothing is removed.
+    Works in place. The remaining non-terminal outcomes are rescaled to keep the total. If they have less than a share
+    ``RARE_VALUE`` of the non-terminal probability, nothing is removed.
     """
     kept, removed = 0.0, 0.0
     for q in range(first, first + n):
@@ -198,7 +199,7 @@ def _leave_out_all(layout: Layout, states: Ints, offsets: Ints, out: Outcomes) -
 
 
 def enforced(layout: Layout, states: Ints, found: Successors) -> Successors:
-    """Successors of states [B, F] without those that violate an invariant."""
+    """Successors of states [B, F], without the outcomes that violate an invariant."""
     if not has_invariants(layout) or len(states) == 0:
         return found
     counts = np.empty(len(states), dtype=np.int64)
@@ -211,9 +212,9 @@ def enforced(layout: Layout, states: Ints, found: Successors) -> Successors:
 
 
 def kept_chances(layout: Layout, states: Ints, found: Successors) -> Floats:
-    """Probability, for each row of successors, that a non-terminal outcome satisfies all invariants, [B].
+    """Probability [B], for each state, that an outcome satisfies all invariants, given that it is non-terminal.
 
-    It is 1 if none satisfies them, or if all outcomes are terminal.
+    It is 1 if no non-terminal outcome satisfies them, or if all outcomes are terminal.
     """
     rows, on = found.rows, ~found.terminated
     kept = all_kept(layout, states[rows], found.states)

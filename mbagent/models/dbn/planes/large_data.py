@@ -1,8 +1,9 @@
-"""Planes with more transitions than fit into a table: distinct patterns, and refinement of splits found in a sample.
+"""Plane data too large for one feature table: distinct patterns, and refinement of splits found in a sample.
 
-A feature table of every cell does not fit into memory if neighbourhoods have thousands of features. In most contexts that the
-splits lead to, all transitions agree. So all cells are counted by the few features of the splits, and only cells of contexts in
-which outcomes differ get a table of all features, rare outcomes first (compare RainForest, Gehrke et al. 1998).
+A table of all features of every cell does not fit into memory if neighbourhoods have thousands of features. In most contexts
+that the splits produce, all cells have the same outcome. Therefore, all cells are counted using only the few features that the
+splits test. A table of all features is made only for contexts whose outcomes differ, from a sample of cells that favours the
+rarer outcome (compare RainForest, Gehrke et al. 1998).
 """
 
 from __future__ import annotations
@@ -55,12 +56,12 @@ ENTRIES_PER_CHUNK = 50_000_000
 
 
 def channel_layout(cardinalities: Sequence[int], encoding: ActionEncoding) -> Layout:
-    """A layout whose factors are the channels; its own features are not used."""
+    """A layout whose factors are the channels; the features of this layout are not used."""
     return make_layout(cardinalities, (), encoding, ordinal=False)
 
 
 def _counted(rows: TransitionBatch) -> tuple[TransitionBatch, Ints]:
-    """The rows that are counted, and their numbers."""
+    """The rows that are counted, and their indices in ``rows``."""
     most = max(1, MOST_CELLS_COUNTED // max(1, rows.before.shape[1]))
     if len(rows) <= most:
         return rows, np.arange(len(rows))
@@ -69,13 +70,14 @@ def _counted(rows: TransitionBatch) -> tuple[TransitionBatch, Ints]:
 
 
 class PlaneTable:
-    """Transitions of planes, as cells with their relative features.
+    """Transitions of planes as cells, each with its relative features.
 
     Attributes:
-        table: neighbourhood features of all distinct patterns of cells, bool [patterns, near].
+        table: neighbourhood features (``near``) of each distinct pattern of a cell, bool [patterns, len(near)].
         whole: whether the table covers all transitions.
         most_patterns: maximum number of rows of a table for a search.
-        every: planes of all transitions and of their next states; of an evenly spaced subset beyond ``MOST_CELLS_COUNTED``.
+        every: planes of the current and next states of all transitions, or of an evenly spaced subset beyond
+            ``MOST_CELLS_COUNTED`` cell values.
 
     Args:
         rows: N transitions.
@@ -121,7 +123,7 @@ class PlaneTable:
         self.actions = np.repeat(encoding.action_class[self.rows.actions], self.n_cells)
 
     def _patterns(self, planes: Factors, actions: Ints) -> tuple[Bools, Ints, Ints]:
-        """Features of the distinct patterns of cells, the pattern of each cell, and the transitions that were used.
+        """Features of each distinct pattern, the index of the pattern of each cell, and the indices of the transitions used.
 
         Evenly spaced transitions are added until there are ``most_patterns`` patterns.
         """
@@ -146,19 +148,19 @@ class PlaneTable:
         return table, np.concatenate(pattern)[order].ravel(), rows[order]
 
     def observed(self, channel: int) -> Observed:
-        """A channel's values in all cells; patterns are rows of ``table``."""
+        """A channel's values in all cells that count for it; patterns are row indices of ``table``."""
         now, then = (planes[:, channel].reshape(-1).astype(np.int64) for planes in (self.before, self.after))
         return Observed(self.pattern, self.actions, now, then).select(self.cells_since(channel))
 
     def determined_by(self, channel: int) -> Ints | None:
-        """Features that alone determine a channel (``features.determined_by``); None if none do or it rarely changed."""
+        """As ``features.determined_by``, but also None if the channel rarely changed."""
         before, after = (planes[:, channel] for planes in self.every)
         if (before != after).sum() < FEWEST_CHANGES:
             return None
         return determined_by(channel, self.features, self.near, *self.every, self.every_action)
 
     def copying(self, channel: int, features: Ints) -> tuple[list[Question], Bools]:
-        """The questions about a channel that the given features determine, with the table of those features."""
+        """The questions about a channel determined by ``features``, and a feature table of only these features."""
         observed, cardinality = self.observed(channel), self.cardinalities[channel]
         determined = feature_values(self.features[features], self.before, self.rows.actions)[self.cells_since(channel)]
         value = np.concatenate([determined, np.ones((len(determined), 1), dtype=np.bool_)], axis=1).argmax(axis=1)
@@ -168,16 +170,16 @@ class PlaneTable:
         return ask(channel, cardinality, replace(observed, pattern=pattern)), determined[first]
 
     def cells_since(self, channel: int) -> Ints:
-        """Numbers of the cells that count for a channel."""
+        """Indices of the cells that count for a channel."""
         return np.arange(min(self.since[channel] * self.n_cells, len(self.actions)), len(self.actions))
 
     def far_values(self, numbers: Ints) -> Bools:
-        """Features that are the same at all positions, bool [N, len(numbers)]."""
+        """Values of features that are the same at all positions, bool [N, len(numbers)]."""
         found = [far_value(self.features[d], self.before, self.rows.actions, self.after) for d in numbers]
         return np.stack(found, axis=1)
 
     def split(self, asked: Sequence[Question], table: Bools, numbers: Ints) -> list[Search]:
-        """Completed searches for the splits of questions; the columns of ``table`` are the relative features ``numbers``."""
+        """Completed split searches for the questions; the columns of ``table`` are the relative features ``numbers``."""
         kinds = feature_kinds(self.features)[numbers]
         found = find_splits([q.target for q in asked], table, kinds, self.encoding.n_action_classes, self.in_pairs)
         return [search.renamed(numbers) for search in found]
@@ -210,15 +212,15 @@ FEWEST_ROOM = 300
 
 
 def refine(planes: PlaneTable, asked: Sequence[Question], found: list[Search]) -> list[Search]:
-    """Continues searches that were made on a sample, with all transitions; others are returned unchanged.
+    """Continues searches that were made on a sample, using all transitions; without a sample, returns them unchanged.
 
     Args:
         planes: the transitions.
         asked: the questions about channels.
-        found: the search of each on the sample.
+        found: each question's search on the sample.
 
     Returns:
-        Searches with further splits, whose rows are counts of all transitions: one for each context.
+        Searches with further splits; they have one row for each context, with its counts over all transitions.
     """
     if planes.whole or not asked:
         return found
@@ -236,7 +238,7 @@ class _Refined:
     Attributes:
         splits: all splits so far.
         context: context of each cell, int32 [N * P]; -1 if the question does not apply to it.
-        n, e: cells and positives of each context, int64 [C].
+        n, e: number of cells and of positives in each context, int64 [C].
         action, value, prior_mean: of each context, see ``Target`` and ``Search``.
         closed: contexts in which no further split was found, bool [C].
     """
@@ -255,12 +257,12 @@ class _Refined:
         self.follow(search.splits)
 
     def positives(self) -> Bools:
-        """In which cells the value came next, bool [N * P]."""
+        """In which cells the question's value came next, bool [N * P]."""
         result: Bools = (self.planes.every[1][:, self.channel] == self.question.values[0]).ravel()
         return result
 
     def follow(self, splits: Sequence[Split]) -> None:
-        """Moves all cells to their contexts under further splits, and counts them."""
+        """Assigns all cells to their new contexts after further splits, and recounts each context."""
         planes = self.planes
         used = np.unique([split.feature for split in splits if split.feature >= 0]).astype(np.int64)
         which = np.asarray([np.searchsorted(used, s.feature) if s.feature >= 0 else -1 for s in splits], dtype=np.int64)
@@ -278,24 +280,24 @@ class _Refined:
         self.e = np.bincount(self.context[included & self.positives()], minlength=size)
 
     def search(self) -> Search:
-        """A search with these splits, whose rows are the contexts."""
+        """A search with all splits so far; its rows are the contexts."""
         contexts = np.arange(len(self.action))
         search = Search(Target(contexts, self.n, self.e, contexts, self.action, self.value))
         search.splits, search.prior_mean = self.splits, self.prior_mean
         return search
 
     def open_contexts(self, tables: Tables) -> Bools:
-        """Contexts with both outcomes that are worth searching, bool [C]."""
+        """Mask of the contexts that have both outcomes and are worth searching, bool [C]."""
         result: Bools = ~self.closed & (-evidences(self.e, self.n, tables) > WORTH_SEARCHING) & (self.e > 0) & (self.e < self.n)
         return result
 
     def graft(self, found: Sequence[Search], contexts: Ints, near: Ints) -> bool:
-        """Appends the splits that were found in some contexts; returns whether there are any.
+        """Appends the splits found in the given contexts; returns whether there are any.
 
         Args:
-            found: the search of each context, whose features are indices of ``near``.
+            found: the search in each context; its splits refer to features by their index in ``near``.
             contexts: ascending, int64 [K].
-            near: numbers of features.
+            near: feature numbers, int64.
         """
         splits, rates = [], self.e / np.maximum(self.n, 1)
         for context, search in zip(contexts[::-1], found[::-1], strict=True):  # last first: earlier contexts keep their numbers
@@ -320,7 +322,7 @@ class _Refined:
 
 
 def _round(planes: PlaneTable, refined: Sequence[_Refined], most: int, certain: float) -> bool:
-    """Continues the searches in contexts with both outcomes; returns whether any split was found."""
+    """Runs one round of refinement in all open contexts; returns whether any split was found."""
     tables = evidence_tables(max(int(each.n.max(initial=0)) for each in refined) + 1, certain)
     opened = [np.flatnonzero(each.open_contexts(tables)) for each in refined]
     limit = _cells_per_context([np.minimum(r.e, r.n - r.e)[o] for r, o in zip(refined, opened, strict=True)], most // 4)
@@ -342,7 +344,7 @@ def _round(planes: PlaneTable, refined: Sequence[_Refined], most: int, certain: 
 
 
 def _cells_per_context(rarer: Sequence[Ints], room: int) -> int:
-    """Maximum number of cells of the rarer outcome for each context, so that their sum is at most ``room``."""
+    """Limit per context on cells of the rarer outcome, such that the total over all contexts is at most ``room``; at least 1."""
     counts = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *rarer]))
     below = np.concatenate([[0], np.cumsum(counts)])
     for i, count in enumerate(counts):
@@ -352,11 +354,11 @@ def _cells_per_context(rarer: Sequence[Ints], room: int) -> int:
 
 
 def _sampled(each: _Refined, contexts: Ints, limit: int, chosen: list[Ints]) -> list[Search]:
-    """A search for each context on a sample of its cells; the cells are added to ``chosen``, and rows are numbered as there.
+    """A search for each context on a sample of its cells. Appends these cells to ``chosen``; target rows are positions in it.
 
-    Of the rarer outcome, up to ``limit`` evenly spaced cells are taken; of the other one, three times as many plus
-    ``FEWEST_ROOM``. Sampled cells are unweighted: a feature absent from the sample may still occur in the population. Such a
-    sample identifies discriminative features but not base rates, so each context is searched separately.
+    The sample has up to ``limit`` evenly spaced cells of the rarer outcome, and up to three times as many plus ``FEWEST_ROOM``
+    of the other. Sampled cells are unweighted: a feature absent from the sample may still occur in the population. Such a sample
+    identifies discriminative features but not base rates, so each context is searched separately.
     """
     number = np.full(len(each.action) + 1, -1, dtype=np.int32)  # the last entry: cells without a context
     number[contexts] = np.arange(len(contexts))
@@ -385,9 +387,9 @@ def _walk(values: Bools, which: Ints, first: Ints, targets: Ints, context: NDArr
 
     Args:
         values: features, bool [U, n].
-        which: the feature of each split, int64 [S]; -1 for none.
-        first: where the targets of each split begin, int64 [S + 1].
-        targets: new context of each old one if the feature is off and on, int64 [2, sum of contexts].
+        which: row of ``values`` that each split tests, int64 [S]; -1 for none.
+        first: column of ``targets`` where each split begins, int64 [S + 1].
+        targets: new context of each old context if the feature is off (row 0) or on (row 1), int64 [2, contexts of all splits].
         context: context of each cell, int32 [n]; negative for none.
     """
     for cell in range(len(context)):

@@ -1,6 +1,6 @@
 """Dynamic Bayesian networks of planes: one set of decision graphs for each channel, with parameters tied over all positions.
 
-Where the dynamics differ between positions, each cell has its own graph instead; held-out transitions decide.
+If the dynamics depend on the position, each cell gets graphs of its own instead; held-out transitions decide between the two.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ SOME_CELLS = 100_000
 
 
 def fit_channels(planes: PlaneTable) -> tuple[Graphs, list[Question], list[Search]]:
-    """Graphs of all channels without synchronic arcs, and of ``terminated``."""
+    """Graphs without synchronic arcs for all channels and ``terminated``, their questions and searches."""
     questions: list[Question] = []
     copy_questions: list[Question] = []
     copies: list[Search] = []
@@ -82,7 +82,7 @@ def fit_channels(planes: PlaneTable) -> tuple[Graphs, list[Question], list[Searc
 
 
 def _ends(planes: PlaneTable, numbers: Ints) -> tuple[list[Question], list[Search]]:
-    """Questions and searches for the end of episodes, with features that are the same at all positions."""
+    """Questions and searches for ``terminated``, with features that have the same value at all positions."""
     rows, far = planes.rows, planes.far_values(numbers)
     first, pattern = distinct(np.packbits(far, axis=1))
     zeros, ends = np.zeros(len(rows), dtype=np.int64), rows.terminated.astype(np.int64)
@@ -96,12 +96,12 @@ def _ends(planes: PlaneTable, numbers: Ints) -> tuple[list[Question], list[Searc
 
 
 def fit_synchronic(planes: PlaneTable, layout: Layout, graphs: Graphs) -> tuple[Graphs, list[Question], list[Search]]:
-    """Graphs of the channels whose cells have synchronic arcs, and of ``terminated``.
+    """Graphs of channels with synchronic arcs, and of ``terminated`` if it has any; their questions and searches.
 
     Args:
         planes: the transitions.
-        layout: of the board.
-        graphs: of all cells, without synchronic arcs.
+        layout: the board's layout.
+        graphs: graphs of all cells, without synchronic arcs.
     """
     synchronic, all_questions, found = [], [], []
     for channel, numbers in _dependent(planes, layout, graphs).items():
@@ -150,12 +150,12 @@ def _dependent(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[int, 
 
 
 def _is_earlier(feature: Ints, channel: int) -> bool:
-    """Whether a feature's cell of the next state is drawn before the channel's cell that the feature is relative to."""
+    """Whether the next-state cell that a feature tests is drawn before the channel's cell at offset (0, 0)."""
     return bool(feature[1] < channel or (feature[1] == channel and tuple(feature[3:5]) < (0, 0)))
 
 
 def _errors(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[tuple[int, int], tuple[Floats, Floats]]:
-    """Errors and their variances, [n, H, W] each, of every uncertain (channel, value) in n of the rows."""
+    """Prediction errors and their variances, [n, H, W] each, for every uncertain (channel, value), from a sample of n rows."""
     if len(planes.rows) == 0:
         return {}
     n = min(max(100, SOME_CELLS // planes.n_cells), len(planes.rows))
@@ -186,7 +186,7 @@ def find_mutexes(
         board: positions of the cells.
         cardinalities: number of values of each channel's cells.
         some: a sample of n transitions.
-        ones: predicted probability of each cell to be on after those, [n, C, H, W].
+        ones: predicted probability that each cell is on after each sampled transition, [n, C, H, W].
     """
     if len(rows) == 0:
         return ()
@@ -223,11 +223,11 @@ class LocalGraphModel(DecisionGraphModel):
         space: a stack of planes; all cells of a channel have the same number of values.
         n_actions: number of enumerated actions A.
         reach: extent of neighbourhoods; None to choose it on held-out episodes.
-        validation: share of episodes held out, for the report and for choices; the final graphs are fitted to all rows.
+        validation: share of episodes held out for the report and for model selection; the final graphs are fitted to all rows.
         parts: see DecisionGraphModel.
 
     Raises:
-        ValueError: the space is no stack of planes of that kind.
+        ValueError: the space is not such a stack of planes.
     """
 
     def __init__(
@@ -251,7 +251,7 @@ class LocalGraphModel(DecisionGraphModel):
         self._clear(cards, reach or Reach())
 
     def _clear(self, cards: tuple[int, ...], reach: Reach) -> None:
-        """Sets an unfitted model with the given reach."""
+        """Resets to an unfitted model with the given reach."""
         self.reach = reach
         features = relative_features(cards, self.parts, reach)
         none = np.zeros(0, dtype=np.int64)
@@ -289,7 +289,7 @@ class LocalGraphModel(DecisionGraphModel):
         return replace(report, seconds=time.perf_counter() - began)
 
     def _variables(self) -> list[Variable]:
-        """Channels; their parents are relative features."""
+        """Channels that have graphs; their parents are relative features."""
         channels = [int(c) for c in self.local.graphs.changing if c < len(self.local.cardinalities)]
         found = []
         for channel in channels:
@@ -313,13 +313,13 @@ class LocalGraphModel(DecisionGraphModel):
         return last_changes(rows, len(self.local.cardinalities) + 1, self._channel_log_probs)
 
     def _channel_log_probs(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
-        """Log-probabilities as for factors, summed over each channel, [T, C + 1]."""
+        """As ``_factor_log_probs``, but summed over the cells of each channel, [T, C + 1]."""
         each = self._factor_log_probs(train, tests)
         cells = self.board.to_planes(each[:, :-1]).sum(axis=(2, 3))
         return np.concatenate([cells, each[:, -1:]], axis=1)
 
     def _fit_quickly(self, rows: TransitionBatch) -> None:
-        """Fits without synchronic arcs and pairwise splits."""
+        """Fits without synchronic arcs or pairwise splits."""
         self._learn(rows, jointly=False, in_pairs=False)
 
     def _snapshot(self) -> Any:
@@ -329,7 +329,7 @@ class LocalGraphModel(DecisionGraphModel):
         self.local, self.fitted, self.reach = snapshot
 
     def _best_reach(self, train: TransitionBatch, held_out: TransitionBatch) -> Reach:
-        """The smallest reach beyond which held-out likelihood does not improve; from a sample of rows."""
+        """The smallest reach beyond which held-out likelihood stops improving, judged on a sample of rows."""
         if len(held_out) == 0:
             return Reach()
         some, tests = thinned(train, SOME_ROWS), thinned(held_out, SOME_TESTS)
@@ -345,12 +345,12 @@ class LocalGraphModel(DecisionGraphModel):
         return best
 
     def _reach_log_probs(self, reach: Reach, train: TransitionBatch, tests: TransitionBatch) -> Floats:
-        """Log-probabilities of transitions after a quick fit to others with the given reach."""
+        """Log-probabilities of ``tests`` after a quick fit to ``train`` with the given reach."""
         self._clear(self.local.cardinalities, reach)
         return self._quick_log_probs(train, tests)
 
     def _learn(self, rows: TransitionBatch, jointly: bool = True, since: Ints | None = None, in_pairs: bool = True) -> None:
-        """Fits graphs of all cells, then mutex groups, then synchronic arcs (if ``jointly``)."""
+        """Fits the graphs of all channels, then finds mutex groups and, if ``jointly``, synchronic arcs."""
         local = self.local
         planes = PlaneTable(rows, self.board, local.cardinalities, local.features, self.encoding, since, in_pairs)
         self.searched, self.counted = len(planes.rows), len(planes.every_action)
@@ -370,7 +370,7 @@ class LocalGraphModel(DecisionGraphModel):
             self._instantiate((*questions, *more_questions), (*found, *more_found))
 
     def _enforce_invariants(self, rows: TransitionBatch) -> None:
-        """Enforces the invariants of the transitions that the model's own samples would violate."""
+        """Enforces those invariants of the observed transitions that the model's samples would otherwise violate."""
         invariants, layout, rng = (
             find_invariants(rows, self.board, self.local.cardinalities),
             self.fitted.layout,
@@ -390,18 +390,18 @@ class LocalGraphModel(DecisionGraphModel):
         self.fitted = replace(self.fitted, layout=with_invariants(layout, invariants))
 
     def _ones(self, rows: TransitionBatch) -> Floats:
-        """Probability of each cell's value 1, [N, C, H, W]."""
+        """Probability that each cell's next value is 1, [N, C, H, W]."""
         start = np.concatenate([[0], np.cumsum(self.cardinalities)])[:-1].astype(np.int64)
         return self.board.to_planes(self.marginals(rows.states, rows.actions)[:, start + 1])
 
     def for_space(self, space: FactoredSpace | spaces.Space[Any]) -> LocalGraphModel:
-        """This model for planes of another size, without another fit.
+        """The same model for planes of another size, without refitting.
 
         Args:
-            space: a stack of planes, as a Gymnasium space or factored.
+            space: a stack of planes, as a Gymnasium space or a FactoredSpace.
 
         Raises:
-            ValueError: it is no stack of planes, or the channels or their numbers of values differ.
+            ValueError: the space is not a stack of planes, or its channels or their numbers of values differ from this model's.
         """
         space = space if isinstance(space, FactoredSpace) else FactoredSpace(space)
         if space.planes is None:
@@ -467,7 +467,7 @@ class LocalGraphModel(DecisionGraphModel):
 
 
 def channel_cardinalities(space: FactoredSpace) -> tuple[int, ...] | None:
-    """Number of values of each channel's cells, or None if they differ within a channel."""
+    """Number of values of the cells of each channel; None if it differs within any channel."""
     assert space.planes is not None
     cells = space.planes.to_planes(np.asarray(space.cardinalities)[None])[0]
     alike = (cells == cells[:, :1, :1]).all()
@@ -488,12 +488,12 @@ MOST_UNTIED_CELLS = 2000
 
 
 class PlaneGraphModel(LocalGraphModel):
-    """A LocalGraphModel that uses graphs for each single cell if these predict held-out transitions clearly better.
+    """A LocalGraphModel that switches to separate graphs for each cell if these predict held-out transitions clearly better.
 
-    This happens where planes merely encode a position and dynamics differ between positions.
+    This happens if planes merely encode a position and the dynamics depend on that position.
 
     Attributes:
-        flat: the model without tied parameters, whose graphs this model then uses; else None.
+        flat: the model without tied parameters if this model uses its graphs; None if this model uses tied graphs.
     """
 
     flat: DecisionGraphModel | None = None
