@@ -200,7 +200,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
         return model, LearnedReward(space.cardinalities, n, space.planes, seed=self._planning_seed, parts=parts)
 
     def _recode(self, space: FactoredSpace) -> None:
-        """Changes to the factor values of ``space``; if they differ, model and learned reward are replaced by unfitted ones."""
+        """Adopts the factor values of ``space``; if they changed, replaces model and learned reward by unfitted ones."""
         policy = self.policy
         if space.same_factors(policy.factored):
             return
@@ -403,7 +403,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
         return self
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """Changes the environment (same spaces); without a custom reward the goal becomes the new environment's."""
+        """Adopts an environment with the same spaces and, without a custom reward, that environment's reward as the goal."""
         super().set_env(env, force_reset)
         assert self.env is not None
         self._recorder = None
@@ -587,7 +587,7 @@ class ModelLearningAgent(EnvironmentAlgorithm):
             self._refresh()
 
     def save_transitions(self, path: Target) -> None:
-        """Writes the observed transitions as an ``.npz`` of plain arrays; see TransitionDataset.save, also for its errors."""
+        """Writes the observed transitions as an ``.npz`` of plain arrays; argument and errors: see TransitionDataset.save."""
         self.experience.dataset.save(path)
 
     def load_transitions(self, path: Target) -> None:

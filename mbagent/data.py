@@ -75,7 +75,7 @@ class TransitionBatch:
         return self.after.astype(np.int64, copy=False)
 
     def select(self, rows: NDArray[Any] | slice) -> TransitionBatch:
-        """The rows with the given indices or mask, in the same types; large selections of mapped arrays are mapped as well."""
+        """Rows by index or mask, in the same types; large selections from memory-mapped arrays are memory-mapped too."""
         return TransitionBatch(*(_selected(getattr(self, name), rows) for name in _KEPT))
 
     def narrowed(self, kind: np.dtype[Any]) -> TransitionBatch:
@@ -308,7 +308,7 @@ def _table(source: files.Target) -> tuple[tuple[int, ...], int, TransitionBatch]
 
 
 def _read_description(folder: Path) -> dict[str, Any]:
-    """The description of a dataset's folder; ``rows`` is None for folders of versions that did not store it."""
+    """Description stored in a dataset's folder; ``rows`` is None if the version that wrote it stored no row count."""
     try:
         about = json.loads((folder / _DESCRIPTION).read_text(encoding="utf-8"))
         kept = {"cardinalities": [int(c) for c in about["cardinalities"]], "n_actions": int(about["n_actions"])}
@@ -372,7 +372,7 @@ def _mapped(folder: Path, n_factors: int, kind: np.dtype[Any]) -> TransitionBatc
 
 
 def _write(folder: Path, batch: TransitionBatch, n_before: int) -> None:
-    """Writes rows after the first ``n_before``; they become valid when ``dataset.json`` contains the new number of rows."""
+    """Writes new rows after the first ``n_before``; they become valid when ``dataset.json`` has the new row count."""
     for (name, kind), kept in zip(_types(batch.before.dtype).items(), _KEPT, strict=True):
         values = np.ascontiguousarray(getattr(batch, kept), dtype=kind)
         with (folder / f"{name}.bin").open("r+b") as file:

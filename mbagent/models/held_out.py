@@ -22,7 +22,7 @@ PERFECT_LOG_PROB = -1e-3
 
 
 def better(logs: NDArray[np.float64], others: NDArray[np.float64], errors: float = 3.0) -> bool:
-    """Whether log-probabilities [N] exceed ``others``, of the same transitions, by ``errors`` standard errors on average."""
+    """Whether log-probabilities [N] beat ``others`` (same transitions): mean gain above ``errors`` standard errors."""
     gain = logs - others
     return bool(len(gain) > 1 and gain.mean() > errors * gain.std(ddof=1) / np.sqrt(len(gain)))
 
@@ -33,7 +33,7 @@ def thinned(rows: TransitionBatch, most: int) -> TransitionBatch:
 
 
 def within(data: TransitionDataset, most: int) -> TransitionDataset:
-    """The dataset, or evenly spaced transitions of it, at least one, so that transitions times factors is at most ``most``."""
+    """The dataset, thinned evenly until transitions times factors <= ``most``; at least one transition is kept."""
     n = max(1, most // max(1, len(data.cardinalities)))
     if len(data) <= n:
         return data
@@ -58,7 +58,7 @@ def following_steps(rows: TransitionBatch) -> tuple[NDArray[np.int64], NDArray[n
 
 
 def _follow(rows: TransitionBatch, later: NDArray[np.int64], earlier: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which of the later transitions begin in the state where the earlier ones end; compared in parts to limit memory."""
+    """Whether each later transition begins where the matching earlier one ends; compared in parts to limit memory."""
     found = np.zeros(len(later), dtype=np.bool_)
     for begin in range(0, len(later), PART):
         part = slice(begin, begin + PART)

@@ -86,7 +86,7 @@ def add_node(graph: GraphArrays, state: Ints, group: int) -> int:
 
 @compiled
 def add_edge(graph: GraphArrays, source: int, action: int, state: Ints, terminated: bool, probability: float) -> int:
-    """Appends a successor of a (node, action) and returns its node; all successors of the pair must be appended in sequence."""
+    """Adds a successor of a (node, action) pair, returns the successor's node; add a pair's successors consecutively."""
     target, edge = add_node(graph, state, graph.groups[source]), graph.sizes[1]
     graph.next_nodes[edge], graph.probabilities[edge], graph.terminated[edge] = target, probability, terminated
     graph.sources[edge], graph.actions[edge] = source, action
@@ -322,7 +322,7 @@ class StateGraph:
         _append(self.arrays, nodes, found.offsets, states, found.terminated, found.probabilities)
 
     def only_terminal(self, nodes: Ints) -> Bools:
-        """Whether each of the ``nodes`` [B] is reached by terminated transitions only, so that no state follows it."""
+        """Whether only terminal transitions lead to each of ``nodes`` [B]; these lack successors, except start states."""
         result: Bools = ~self.arrays.reached[nodes]
         return result
 

@@ -46,14 +46,14 @@ class ModelError:
         return np.interp(self.doubt(states, actions), self.doubts, self.rates)
 
     def doubt(self, states: States, actions: Actions) -> Floats:
-        """Probability of all outcomes but the model's likeliest one, averaged over the model and all members, [B]."""
+        """Probability of outcomes other than the model's most likely one, averaged over the model and all members, [B]."""
         following, ends = likeliest(self.model, states, actions)
         logs = [model.log_prob(states, actions, following, ends) for model in (self.model, *self.members)]
         result: Floats = 1.0 - np.exp(logs).mean(axis=0)
         return result.clip(0.0, 1.0)
 
     def disagreement(self, states: States, actions: Actions) -> Floats:
-        """Standard deviation, over the models, of the probability of the likeliest outcome, [B]; more data would reduce it."""
+        """Standard deviation of P(model's most likely outcome) over model and members, [B]; more data would reduce it."""
         following, ends = likeliest(self.model, states, actions)
         logs = [model.log_prob(states, actions, following, ends) for model in (self.model, *self.members)]
         result: Floats = np.exp(logs).std(axis=0)
@@ -125,7 +125,7 @@ def _check_probabilities(model: TransitionModel, row: TransitionBatch) -> None:
 
 
 def parts_of(rows: TransitionBatch, n_parts: int, seed: int) -> Ints:
-    """Part of each row, 0 ... n_parts - 1, by whole episodes, int64 [N]; if there are few episodes, by runs of rows instead."""
+    """Part of each row, 0 ... n_parts - 1, int64 [N]: sets of whole episodes or, if there are few, of runs of rows."""
     groups = np.unique(rows.episodes, return_inverse=True)[1]
     if groups.max() + 1 < 2 * n_parts:
         groups = np.arange(len(rows)) * 2 * n_parts // len(rows)
@@ -135,7 +135,7 @@ def parts_of(rows: TransitionBatch, n_parts: int, seed: int) -> Ints:
 
 
 def likeliest(model: TransitionModel, states: States, actions: Actions) -> tuple[States, Bools]:
-    """Likeliest next states, int64 [B, F], and terminated, bool [B]: by the model's method, or factor by factor."""
+    """Most likely next states, int64 [B, F], and ``terminated``, bool [B]: by ``model.likeliest``, else by factor."""
     method = getattr(model, "likeliest", None)
     if method is not None:
         found: tuple[States, Bools] = method(states, actions)

@@ -60,7 +60,7 @@ def random_returns(
 def forecast_returns(
     model: DirectForecastModel, goal: Reward, states: States, keys: Keys, horizon: int, gamma: float, first_actions: Actions
 ) -> Floats:
-    """Discounted return of one random action sequence from each state, with direct forecasts of every step (paper 4.2).
+    """Discounted return of one action sequence per state, random after the first action; direct forecasts (paper 4.2).
 
     The state before step k (from 0) is sampled from the k-step model, given the first k actions; the step itself is sampled from
     the one-step model. So errors do not accumulate over steps. The samples of different steps do not form one trajectory; this

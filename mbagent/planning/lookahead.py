@@ -28,7 +28,7 @@ _FAR = np.int64(2**62)
 
 @compiled
 def n_draws(layer: int, n_samples: int) -> int:
-    """Number of samples for each (state, action) of a layer of ``layer`` states: a power of two, at most ``n_samples``."""
+    """Samples per (state, action) in a layer of size ``layer``: ``n_samples``; in large ones, a smaller power of two."""
     wanted, draws = max(LAYER_WIDTH // max(layer, 1), 1), 1
     if wanted >= n_samples:
         return n_samples
@@ -154,7 +154,7 @@ def _expand_levels(
     reach: Floats,
     depth: Ints,
 ) -> int:
-    """Expands nodes by increasing depth; appends new ones to the first ``n`` of ``waiting`` and returns their new number."""
+    """Expands ``chosen`` by increasing depth; appends new nodes to the ``n`` in ``waiting``; returns the new ``n``."""
     first_edge, first_node, last = graph.sizes[1], graph.sizes[0], np.int64(-1)
     for _ in range(len(chosen)):
         level, layer = _FAR, 0
@@ -185,7 +185,7 @@ def _expand_levels(
 
 
 def layer_seed(seed: int, depth: int) -> int:
-    """Seed for one depth: all states and actions there share random numbers, so that they differ only by their effects."""
+    """Seed for one depth: all its states and actions share random numbers, so that they differ only in their effects."""
     return int(derive(seed, depth)[0])
 
 
@@ -260,7 +260,7 @@ def _update_reach(
 
 
 def _draws(sizes: NDArray[np.int64], n_samples: int) -> NDArray[np.int64]:
-    """Samples for layers of the given sizes: powers of two (few distinct values need few model calls), or n_samples."""
+    """Numbers of samples for layer sizes: n_samples or lower powers of two (few distinct values need few model calls)."""
     wanted = np.maximum(LAYER_WIDTH // np.maximum(sizes, 1), 1)
     powers = 2 ** np.floor(np.log2(wanted)).astype(np.int64)
     return np.where(wanted >= n_samples, n_samples, np.minimum(powers, n_samples))

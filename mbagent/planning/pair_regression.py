@@ -27,7 +27,7 @@ MOST_PAIR_FEATURES = 2000
 
 
 class PairRegression:
-    """Regression of many targets on the same states; features as in LeafValues, none for the commonest value of each factor.
+    """Regression of many targets on fixed states. Features as in LeafValues: a factor's commonest value has none.
 
     The kernel of two states that share d features is d + PAIRED d (d - 1) / 2: each shared pair acts as a further feature with
     weight PAIRED.
@@ -59,7 +59,7 @@ class PairRegression:
         self._factor, self._bounds = cho_factor(centred + RIDGE * np.eye(len(states))), (low, high)
 
     def _active_features(self, states: States) -> tuple[Ints, Ints]:
-        """Active features of states [M, F], concatenated, and the offset of each state's first one, int64 [M + 1]."""
+        """Active features of states [M, F], concatenated, and offsets where each state's features begin, int64 [M + 1]."""
         rows, factors = np.nonzero(states != self._common)
         column = self._column[self._first[factors] + states[rows, factors]]
         known = column >= 0

@@ -189,7 +189,7 @@ class ValueIterationPlanner:
         return self._config
 
     def _race(self, default: LookaheadConfig, task: Task) -> LookaheadConfig:
-        """Learns leaf values for the goal; races the lookahead with them, the one without, and the values after one step."""
+        """Learns the goal's leaf values; races lookaheads with them, without them, and with them expanding only the root."""
         settings = self.settings
         leaf, visited = learn_values(task)
         if len(leaf.common) == 0:
@@ -297,7 +297,7 @@ class MctsPlanner(ValueIterationPlanner):
         return found
 
     def _reused_search(self, roots: States) -> _Search | None:
-        """The last decision's search, with a new root; None if it has too few states after that, or too many in all."""
+        """Last decision's search with a new root; None if its states are too many, or too few are reachable from the root."""
         last, self._last = self._last, None  # if the goal fails now, no incomplete search is kept
         if last is None or len(roots) != 1 or len(last.graph) > MAX_KEPT:
             return None
@@ -344,7 +344,7 @@ class _Search:
         return self._result()
 
     def _run_until(self, deadline: float) -> Expanded:
-        """Runs at least one batch; further ones if they and the final value iteration should end before the deadline."""
+        """Runs a batch, then more while one more batch and the final value iteration should end before the deadline."""
         size, done, now = self.settings.batch_size, 0, time.perf_counter()
         batch = empty_batch(len(self.tree.roots), size, self.settings.horizon)
         last = 0.0
@@ -418,7 +418,7 @@ def _first_tree(solution: Values, roots: Ints) -> SearchTree:
 
 @lru_cache(maxsize=4096)
 def _key(seed: int, number: int) -> np.uint64:
-    """Key of the search's random numbers (0), and of the expansions of the batch after ``number - 1`` simulations."""
+    """Key of random numbers: search (``number`` 0), or expansions of the batch after ``number - 1`` simulations."""
     key: np.uint64 = (derive(seed, _SEARCH_SALT) if number == 0 else derive(seed, _SEARCH_SALT, number))[0]
     return key
 

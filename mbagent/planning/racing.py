@@ -1,4 +1,4 @@
-"""Racing of lookahead configurations in simulated episodes: a later one replaces the best so far only if it is clearly better."""
+"""Racing of lookahead configurations in simulated episodes: a later one replaces the best only if clearly better."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class _Trial:
         self._alive, self._total = np.arange(RACED_EPISODES), [np.zeros(RACED_EPISODES)]
 
     def returns(self, n_blocks: int) -> Floats:
-        """Discounted return [RACED_EPISODES] of each episode after ``n_blocks`` blocks, or at its end if that is earlier."""
+        """Each episode's discounted return, [RACED_EPISODES], up to ``n_blocks`` blocks or its end, whichever is earlier."""
         while len(self._total) <= n_blocks * BLOCK_STEPS:
             self._step()
         return self._total[n_blocks * BLOCK_STEPS]

@@ -97,7 +97,7 @@ def _in_order(trace: PlanTrace, action: int, continuations: list[Floats]) -> Ite
     waiting: list[tuple[float, list[int], float]] = []
 
     def begin(path: list[int], probability: float, bound: float, node: int, chosen: int) -> None:
-        """Adds the continuations of a path by an action; ``bound``: probability of the path's most probable full sequence."""
+        """Adds all extensions of a path by action ``chosen``; ``bound``: upper bound of its completions' probabilities."""
         first = graph.first[node, chosen]
         for edge in range(first, first + graph.counts[node, chosen]):
             joint = probability * graph.probabilities[edge]

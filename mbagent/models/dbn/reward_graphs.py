@@ -134,13 +134,13 @@ def _rates(nodes: Nodes) -> Floats:
 
 
 def _chosen(classes: Ints, most: int) -> Ints:
-    """Numbers of the rows used in the search, at most ``most``."""
+    """Numbers of the rows used in the search: at most ``most``, and the first row of each class."""
     if len(classes) <= most:
         return np.arange(len(classes))
     rare, common = np.flatnonzero(classes > 0), np.flatnonzero(classes == 0)
     n_rare = min(len(rare), most // 2)
     picked = [group[np.linspace(0, len(group) - 1, n).astype(np.int64)] for group, n in ((rare, n_rare), (common, most - n_rare))]
-    chosen: Ints = np.unique(np.concatenate(picked))
+    chosen: Ints = np.unique(np.concatenate([*picked, np.unique(classes, return_index=True)[1]]))
     return chosen
 
 
@@ -174,7 +174,7 @@ def _varying(features: Ints, states: NDArray[Any]) -> Ints:
 
 
 def _kinds(rows: TransitionBatch, layout: Layout, candidates: Ints) -> Ints:
-    """Kind of each feature, int64 [D]: splits by one kind make others of that kind more probable, see ``find_splits``."""
+    """Kind of each feature, int64 [D]; a split by one makes others of its kind more probable, see ``find_splits``."""
     of_single = feature_kinds(layout, rows.before, (rows.before != rows.after).any(axis=0))
     number = {tuple(key): i for i, key in enumerate(np.stack([layout.factor, layout.value, layout.top], axis=1).tolist())}
     most, kinds = int(of_single.max(initial=0)) + 1, np.empty(len(candidates), dtype=np.int64)
@@ -226,7 +226,7 @@ def _leaf(
     encoding: Bools,
     nodes: Ints,
 ) -> int:
-    """The leaf that a transition leads to from a node on, or -1; its arguments are arrays, since reading tuples is slower."""
+    """Leaf a transition reaches from ``node``, -1 if ``node`` is -1; arguments are arrays: reading tuples is slower."""
     while node >= 0 and nodes[node, 0] >= 0:
         feature = nodes[node, 0]
         kind = features[feature, 0]

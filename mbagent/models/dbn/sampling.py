@@ -95,7 +95,7 @@ def reset_rates(states: Ints, actions: Ints, w: Work) -> Floats:
 
 @compiled
 def _pick(probs: Floats, start: int, n: int, u: float, otherwise: int) -> int:
-    """Index drawn from ``n`` probabilities of ``probs``, or the most probable one if ``u`` is negative."""
+    """Index drawn by uniform ``u`` from ``n`` probabilities at ``start``; the most probable one if ``u`` is negative."""
     chosen = otherwise if u >= 0.0 else 0
     for k in range(n):
         if u < 0.0:
@@ -112,7 +112,7 @@ def _pick(probs: Floats, start: int, n: int, u: float, otherwise: int) -> int:
 
 @compiled
 def sample(states: Ints, actions: Ints, keys: Keys, greedy: bool, w: Work, following: Ints, terminated: Bools) -> None:
-    """Draws next states into ``following`` [B, F] and ``terminated`` [B], variable u of row b with random number u of key b.
+    """Draws next states ``following`` [B, F] and ``terminated`` [B]: variable u of row b by random number u of key b.
 
     ``following`` must initially be a copy of ``states``. If ``greedy``, each variable gets its most probable value instead of a
     random one.
@@ -216,7 +216,7 @@ def log_prob(states: Ints, actions: Ints, following: Ints, terminated: Bools, w:
 
 @compiled
 def conditionals(states: Ints, actions: Ints, following: Ints, w: Work) -> Floats:
-    """Distribution of each variable, given the next values [B, F] of those that it depends on, [B, sum of cardinalities].
+    """Each variable's distribution, [B, sum of cardinalities], given its synchronic parents in ``following`` [B, F].
 
     The entries of the last variable, the reset, are left at 0.
     """

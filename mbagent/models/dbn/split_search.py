@@ -99,7 +99,7 @@ class PairSearch:
         return found
 
     def _worth(self, search: Search, most: float) -> list[int]:
-        """Contexts with outcomes so uncertain that a pair could have a positive gain, the most uncertain first."""
+        """Up to ``MOST_CONTEXTS`` contexts whose outcomes are uncertain enough for a pair to gain, most uncertain first."""
         n, e = search.counts()
         cost = -evidences(e, n, self.tables)
         return [int(c) for c in np.argsort(-cost, kind="stable")[:MOST_CONTEXTS] if cost[c] > -most]
@@ -114,7 +114,7 @@ class PairSearch:
         return result
 
     def _prior(self) -> Floats:
-        """Log prior odds of each pair of features, [D, D]; known pairs of kinds and unused features are more probable."""
+        """Log prior odds of feature pairs, [D, D]; higher for pairs of kinds already found and features not yet paired."""
         n = len(self.kinds)
         if len(self._found) < TELLING:
             return np.full((n, n), -math.log(max(1.0, n * (n - 1) / 2)) - FIRST_THRESHOLD)
@@ -307,7 +307,7 @@ def go_on(
 def _next_splits(
     searches: Sequence[Search], features: FeatureBlocks, kinds: Ints, n_actions: int, tables: Tables
 ) -> list[tuple[int, Chosen]]:
-    """The best split of each target with a positive gain; once there is a prior, only the half with the largest gains."""
+    """Best split of each open target, if its gain is positive; with a learned prior, only the half with most gain."""
     prior, learned = feature_prior(searches, kinds, features.n_features)
     counts = np.asarray([sum(split.feature >= 0 for split in search.splits) for search in searches])
     narrow = -np.asarray([math.log(n_actions) + 1.0, 2.0, 3.0])
@@ -324,7 +324,7 @@ def _next_splits(
 
 
 def feature_prior(searches: Sequence[Search], kinds: Ints, n_features: int) -> tuple[Floats, bool]:
-    """Log probability of each feature to be split by next [D], and whether it was estimated from the splits so far."""
+    """Log prior of each feature for the next split, [D], and whether this prior was estimated from the splits so far."""
     chosen = [split.feature for search in searches for split in search.splits if split.feature >= 0]
     if len(chosen) < max(3, len(searches) // 10):
         return np.full(n_features, -math.log(n_features)), False

@@ -152,7 +152,7 @@ def _fits(state: Ints, action: int, r: RowWork, n_grid: int) -> bool:
 
 @compiled
 def _distribution(number: int, state: Ints, w: Work) -> tuple[int, int]:
-    """Writes the distribution of a variable or mutex group to ``w.joint``; returns its size and the current value or -1."""
+    """Writes a variable's or mutex group's distribution to ``w.joint``; returns size and current value (group: -1)."""
     n_variables = len(w.layout.outputs)
     if number >= n_variables:
         n = mutex_distribution(number - n_variables, state, w.rates, w.still, w.layout, w.graphs, w.joint) + 1
@@ -220,14 +220,14 @@ def _put(state: Ints, number: int, value: int, layout: Layout, ended: bool) -> b
 
 @compiled
 def reset_draws(rate: float, n_grid: int) -> int:
-    """Number of ``n_grid`` draws for resets: their share or a quarter, but at least one each for resets and usual steps."""
+    """Number of resets among ``n_grid`` draws; if 0 < ``rate`` < 1: share max(``rate``, 1/4), in 1 ... ``n_grid`` - 1."""
     if rate <= 0.0 or rate >= 1.0:
         return 0 if rate <= 0.0 else n_grid
     return max(1, min(n_grid - 1, max(n_grid // 4, math.ceil(rate * n_grid))))
 
 
 def mixed(parts: Sequence[tuple[NDArray[np.int64], NDArray[np.float64], Successors]], n_rows: int) -> Successors:
-    """A mixture of successors; each part has the numbers of its rows [b], its probability for each row [b], and successors."""
+    """Mixture of the parts' successors; a part: its row indices [b], its probability in each row [b], its successors."""
     rows = np.concatenate([which[found.rows] for which, _, found in parts])
     weights = np.concatenate([found.probabilities * share[found.rows] for _, share, found in parts])
     order = np.argsort(rows, kind="stable")
@@ -394,7 +394,7 @@ class GraphPredictions(BaseTransitionModel):
         return following, over
 
     def likeliest(self, states: States, actions: Actions) -> tuple[States, Bools]:
-        """The most probable next states, variable by variable, int64 [B, F], and whether they end the episode, bool [B]."""
+        """Next states with each variable at its most probable value, int64 [B, F]; whether they end the episode, bool [B]."""
         states, actions = self._rows(states, actions)
         return self._draw(states, actions, np.zeros(len(states), dtype=np.uint64), greedy=True)
 

@@ -76,7 +76,7 @@ class Connections:
 
     @torch.no_grad()
     def drop(self, fraction: float) -> None:
-        """Removes the smallest weights by absolute value until this share is removed; includes those removed before."""
+        """Removes connections of least absolute weight until ``fraction`` of all are removed, counting earlier removals."""
         stay = self.total - round(fraction * self.total)
         sizes = torch.cat([p.abs()[self.kept[name]] for name, p in self.weights.items()])
         if len(sizes) <= stay or stay < 1:

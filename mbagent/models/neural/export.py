@@ -26,7 +26,7 @@ LANES = 16
 
 
 def compiled_body(predictor: nn.Module, layout: Layout) -> CompiledBody:
-    """A predictor with its present weights, for inference: compiled if there is a kernel for it, else by torch."""
+    """Inference function for a predictor's current weights: compiled if the predictor has a kernel, else by torch."""
     if isinstance(predictor, DensePredictor):
         dense = pack_dense(predictor)
         return lambda states, actions: dense_logits(states, actions, layout, dense)
@@ -35,7 +35,7 @@ def compiled_body(predictor: nn.Module, layout: Layout) -> CompiledBody:
 
 @torch.inference_mode()
 def in_chunks(predictor: nn.Module, states: States, actions: Actions) -> Floats32:
-    """Logits float32 [B, O, K] of a torch body, in chunks of ``ROWS_PER_CHUNK`` rows, the last one padded with zeros."""
+    """Logits float32 [B, O, K] of a torch predictor, in chunks of ``ROWS_PER_CHUNK`` rows; the last is zero-padded."""
     parts = []
     for start in range(0, max(len(states), 1), ROWS_PER_CHUNK):
         rows = slice(start, min(start + ROWS_PER_CHUNK, len(states)))

@@ -52,7 +52,7 @@ def iterate(model: TransitionModel, states: States, strings: Actions, rng: Rando
 
 
 def number_strings(strings: Actions, n_actions: int) -> Actions:
-    """Number int64 [B] of each string int64 [B, n], whose digits in base ``n_actions`` are the actions, the first one lowest.
+    """Number int64 [B] of each string int64 [B, n]; digits in base ``n_actions`` are the actions, lowest digit first.
 
     Raises:
         ValueError: the strings are too long to be numbered, or an action is out of range.
@@ -127,7 +127,7 @@ def steps_apart(data: TransitionDataset, n: int, seed: int = 0) -> TransitionDat
 
 
 def _far_from_limit(rows: TransitionBatch, n: int) -> Bools:
-    """Mask of the rows, ordered by episode, that are at least ``n`` steps before the limit on the length of episodes."""
+    """Mask of rows that start at least ``n`` steps before the episode length limit; rows must be ordered by episode."""
     if len(rows) == 0:
         return np.zeros(0, dtype=np.bool_)
     _, first, lengths = np.unique(rows.episodes, return_index=True, return_counts=True)

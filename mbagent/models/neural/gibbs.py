@@ -146,7 +146,7 @@ def begin_block(
     work: SweepWork,
     factors: Ints,
 ) -> int:
-    """Initialises rows from ``first`` on, while there is space for the sums of their open factors; returns their number."""
+    """Initialises rows from ``first`` on while the block can hold them and their open factors' sums; returns how many."""
     # The caller keeps all arrays alive, so that reference counting for every factor can be avoided.
     states, probs, factors = borrowed(states), borrowed(probs), borrowed(factors)
     layout, group, k, w = borrowed(layout), borrowed(group), borrowed(block), borrowed(work)
@@ -175,7 +175,7 @@ def begin_block(
 
 @vectorised
 def _draw_bits(probs: Floats, b: int, noise: Floats, factors: Ints) -> None:
-    """The initial sample of row b if all factors are bits; this and the next three are separate so that each is vectorised."""
+    """Draws row b's initial sample if all factors are bits; separate from the next three functions to vectorise each."""
     for i in range(len(noise)):
         factors[b, i] = int((noise[i] >= probs[b, i, 0]) & (probs[b, i, 1] > 0.0))
 
@@ -222,7 +222,7 @@ def _begin_factor(
     w: SweepWork,
     factors: Ints,
 ) -> None:
-    """Draws the initial value of factor i, and sets the bounds outside which the conditioner is evaluated for it."""
+    """Draws factor i's initial value; sets bounds: only random numbers outside them require the conditioner's output."""
     n, start, top = layout.outputs[i], layout.start[i], largest(probs, b, i, layout.outputs[i])
     value = draw_at(probs, b, i, n, w.noise[i])
     trust = trusted(probs, b, i, layout, group, certain)
@@ -240,7 +240,7 @@ def _begin_factor(
 
 @inlined
 def list_columns(b: int, r: int, states: Ints, action: int, layout: Layout, k: Block, w: SweepWork, columns: Ints) -> int:
-    """Lists the columns of row b that are 1 and returns their number; without branches, which would be unpredictable."""
+    """Writes to ``columns`` the indices of row b's columns that are 1; returns the count. No unpredictable branches."""
     n_active, n = active_columns(states, b, action, layout, w.active), 0
     w.on[:] = 0
     for a in range(n_active - layout.n_steps):
@@ -282,7 +282,7 @@ def sum_columns(
 
 @compiled
 def sum_up(n_rows: int, layout: Layout, group: GroupWeights, real_guess: bool, block: Block) -> None:
-    """Sums the inputs of all open factors for the initial values: by group, each for all rows while its weights are cached."""
+    """Sums open factors' inputs at the initial values, one group at a time for all rows, so that weights stay cached."""
     layout, group, k = borrowed(layout), borrowed(group), borrowed(block)
     for i in range(len(layout.outputs)):
         for r in range(n_rows):
@@ -323,7 +323,7 @@ def sample_sweeps(
     sweeps: int,
     real_guess: bool,
 ) -> Ints:
-    """The paper's procedure: samples from the predictor, then ``sweeps`` passes that resample each factor given all others.
+    """The paper's method: samples from the predictor, then resamples every factor given the others, ``sweeps`` times.
 
     Args:
         states: int64 [B, F].

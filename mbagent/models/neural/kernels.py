@@ -53,7 +53,7 @@ _WIDE_HIGH, _WIDE_LOW = 6.93145751953125e-1, 1.42860682030941723212e-6
 
 @compiled
 def exp64(x: float) -> float:
-    """As ``exp32`` in double precision, with relative error 4e-16, for x <= 0; smaller x are clipped to -708."""
+    """Like ``exp32`` in double precision, only for x <= 0, relative error 4e-16; x below -708 is clipped to -708."""
     x = max(x, -708.0)
     n = np.floor(x * 1.4426950408889634 + 0.5)
     r = (x - n * _WIDE_HIGH) - n * _WIDE_LOW
@@ -81,7 +81,7 @@ def activate(table: Floats32, row: int, n: int, code: int) -> None:
 
 @vectorised
 def add_rows(table: Floats32, rows: Ints, n_rows: int, out: Floats32, row: int) -> None:
-    """Adds the rows of ``table`` [rows, G] with the first ``n_rows`` indices in ``rows`` to ``out[row]``; see ``add_columns``."""
+    """Adds to ``out[row]`` [G] the rows ``rows[:n_rows]`` of ``table`` [m, G]; see ``add_columns``."""
     c = 0
     while c + 4 <= n_rows:
         c0, c1, c2, c3 = rows[c], rows[c + 1], rows[c + 2], rows[c + 3]
@@ -96,7 +96,7 @@ def add_rows(table: Floats32, rows: Ints, n_rows: int, out: Floats32, row: int) 
 
 @vectorised
 def add_products(values: Floats32, n_rows: int, n_values: int, weights: Floats32, out: Floats32) -> None:
-    """Adds ``weights`` [4 * m, H] times the first ``n_values`` of ``values`` [R, H] to ``n_rows`` rows of ``out`` [R, 4 * m].
+    """``out`` [R, 4 * m] += ``values`` [R, H] @ ``weights`` [4 * m, H].T; first ``n_rows`` of R, ``n_values`` of H.
 
     Computes four sums at a time, so that ``values`` is read a quarter as often. All rows are processed while the weights of
     these sums are cached; a row's result does not depend on the other rows.
@@ -118,7 +118,7 @@ def add_products(values: Floats32, n_rows: int, n_values: int, weights: Floats32
 
 @vectorised
 def add_columns(table: Floats32, g: int, columns: Ints, n_columns: int, sums: Floats32, row: int) -> None:
-    """Adds to ``sums[row]`` [G] the weights of group g for the first ``n_columns`` of ``columns``; ``table`` is [g, columns, G].
+    """Adds ``table[g, c]`` to ``sums[row]`` [G] for c in ``columns[:n_columns]``; ``table``: weights [g, columns, G].
 
     Processes four columns at a time, so that ``sums`` is read and written a quarter as often; this halves the running time.
     """
@@ -215,7 +215,7 @@ def write_bits(columns: Floats32, row: int, logits: Floats32, b: int) -> None:
 
 @vectorised
 def add_signed(states: Ints, b: int, weights: Floats32, row: int, out: Floats32, out_row: int) -> None:
-    """Adds ``weights[row]`` [F] to ``out[out_row]`` where the bits ``states[b]`` [F] are 1; subtracts it where they are 0."""
+    """For i < F, adds ``weights[row, i]`` to ``out[out_row, i]`` if bit ``states[b, i]`` is 1, else subtracts it."""
     for i in range(states.shape[1]):
         out[out_row, i] += np.float32(2 * states[b, i] - 1) * weights[row, i]
 
@@ -275,7 +275,7 @@ class Layout(NamedTuple):
 
 
 class DenseWeights(NamedTuple):
-    """A ``DensePredictor``: L hidden layers, padded to the widest of them, H; C output columns, padded to a multiple of four.
+    """A ``DensePredictor``'s arrays: L hidden layers of padded size <= H; C output columns, padded to a multiple of 4.
 
     Attributes:
         first: weights from the (state, action) columns, [n_inputs, H]; if L = 0, [n_inputs, C].
@@ -356,7 +356,7 @@ class GroupWeights(NamedTuple):
 
 @inlined
 def active_columns(states: Ints, b: int, action: int, layout: Layout, out: Ints) -> int:
-    """Writes the input columns of row b that are 1 to ``out`` [F + n_steps], the actions' last; returns their number."""
+    """Writes to ``out`` [F + n_steps] indices of row b's input columns that are 1, actions last; returns the count."""
     n = 0
     for factor in range(states.shape[1]):
         value = states[b, factor]
@@ -376,7 +376,7 @@ def active_columns(states: Ints, b: int, action: int, layout: Layout, out: Ints)
 def add_next(
     states: Ints, b: int, i: int, value: int, layout: Layout, group: GroupWeights, columns: Ints, n: int, place: int
 ) -> int:
-    """Adds the column of factor i's next value to the list ``columns`` of ``active_columns``; returns its new length.
+    """Adds factor i's next-value column to ``columns``, the list from ``active_columns``; returns its new length.
 
     ``place`` is the list index of the factor's state column that is 1, if any; if the value is unchanged, only this entry
     changes. Uses no branches, since they would be unpredictable.
@@ -396,7 +396,7 @@ def add_next(
 
 @inlined
 def next_place(states: Ints, b: int, i: int, layout: Layout, place: int) -> int:
-    """Index among ``active_columns`` of the factor after i, if its column is 1, given that of factor i."""
+    """Index of factor i + 1 in the ``active_columns`` list if it has a column that is 1; ``place``: factor i's index."""
     if i < states.shape[1]:
         place += 1 if layout.outputs[i] != 2 else states[b, i]
     return place
@@ -432,7 +432,7 @@ def _dense_block(
     after: Floats32,
     columns: Floats32,
 ) -> None:
-    """Fills ``columns`` [R, C] for rows from ``first`` on; ``now`` and ``after`` [R, H], ``active`` are work space."""
+    """Output ``columns`` [R, C] of ``n_rows`` rows from ``first``; scratch: ``active``; ``now``, ``after`` [R, H]."""
     depth = len(dense.sizes)
     for r in range(n_rows):
         b = first + r
@@ -487,7 +487,7 @@ def dense_logits(states: Ints, actions: Ints, layout: Layout, dense: DenseWeight
 
 @inlined
 def trusted(probs: Floats, b: int, i: int, layout: Layout, group: GroupWeights, certain: float) -> bool:
-    """Whether factor i of row b is sampled from the predictor alone, whose distributions are ``probs`` [B, O, K]."""
+    """Whether to trust the predictor for row b's factor i: no group, or a value of ``probs`` [B, O, K] >= ``certain``."""
     if group.group_of[i] < 0:
         return True
     return bool(probs[b, i, largest(probs, b, i, layout.outputs[i])] >= certain)

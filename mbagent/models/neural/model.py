@@ -142,7 +142,7 @@ class NeuralTransitionModel(NetworkPair):
         )
 
     def _exact_match(self, rows: Examples) -> float:
-        """Weighted share of transitions whose observed outcome is the most likely one, chosen factor by factor."""
+        """Weighted share of transitions whose outcome is the greedy prediction (each factor's most likely value in turn)."""
         states, actions, outcomes = rows.states.numpy(), rows.actions.numpy(), rows.outcomes.numpy()
         logits, probs = self._predict(states, actions)
         likeliest = probs.argmax(axis=2)
@@ -222,7 +222,7 @@ class NeuralTransitionModel(NetworkPair):
         return probs[:, possible]
 
     def probabilities(self, states: States, actions: Actions) -> Floats:
-        """The predictor's distribution of every factor, ``terminated`` last: float64 [B, O, K], 0 for values it does not have."""
+        """The predictor's distribution of each factor, ``terminated`` last: float64 [B, O, K]; 0 beyond its cardinality."""
         return self._predict(*as_rows(states, actions, len(self.cardinalities)))[1]
 
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
@@ -266,7 +266,7 @@ class NeuralTransitionModel(NetworkPair):
         return self.rules(settled=True)
 
     def rules(self, settled: bool = False) -> BitRules | None:
-        """Truth tables of a pruned model of bits, for sampling or, with ``settled``, for search; None for any other model."""
+        """Truth tables of a pruned model of bits, for sampling or (if ``settled``) search; None if it has or uses none."""
         if not len(self._marks) or self.pruned_as == "matrices" or not tabulable(self._marks) or (pair := self._pair()) is None:
             return None
         if self.config.certain not in self._rules:
@@ -283,11 +283,11 @@ class NeuralTransitionModel(NetworkPair):
         return modules(influence(self, effective=True))
 
     def dependent_groups(self) -> list[VariableGroup]:
-        """The groups of variables that depend on each other given state and action; see ``influence.dependent_groups``."""
+        """Groups of variables whose next values are dependent given state and action; see ``pruning.dependent_groups``."""
         return dependent_groups(influence(self, effective=True))
 
     def _pair(self) -> Pair | None:
-        """The networks, if they can be tabulated: of bits and single actions, with a causal conditioner or none; else None."""
+        """The networks if tabulable (only bits, single actions, dense predictor, causal or no conditioner), else None."""
         bits = self.codec.all_binary and self.codec.n_steps == 1 and self.config.conditioner != "others"
         if not bits or not isinstance(self.predictor, DensePredictor):
             return None

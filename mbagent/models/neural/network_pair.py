@@ -130,7 +130,7 @@ class NetworkPair(BaseTransitionModel):
         self._changed()
 
     def _misfit(self, state: Mapping[str, NDArray[Any]]) -> list[str]:
-        """Names of arrays that are missing, unknown, or of the wrong shape (the conditioner's first axis is free)."""
+        """Names of missing, unknown or wrongly shaped arrays (the conditioner's may have a first axis of any length)."""
         own = self.state_dict()
         wrong = sorted((set(own) ^ set(state)) - {PRUNED})
         for name in set(own) - {PRUNED} if not wrong else ():
@@ -148,7 +148,7 @@ class NetworkPair(BaseTransitionModel):
 
     @property
     def parents(self) -> NDArray[np.int8]:
-        """For each outcome bit of a pruned model, its parents and the fixed values of the other bits; empty for other models."""
+        """Parents of each outcome bit and fixed values of other bits (``truth_tables.find_parents``); empty if not pruned."""
         return self._marks
 
     def connections(self) -> dict[str, Connections]:

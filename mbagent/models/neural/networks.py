@@ -1,4 +1,4 @@
-"""The networks of the paper's section 3: the predictor (3.1), also with shared weights on planes, and the conditioner (3.2).
+"""The networks of the paper's section 3: predictor (3.1), with a variant for planes, and conditioner (3.2).
 
 The paper's variables are bits; here a variable is a *factor* with any number of values (a bit is a factor with two), and
 termination is an additional output factor, the last. On planes, weights are shared over positions (paper section 5), so the
@@ -295,7 +295,7 @@ class Conditioner(nn.Module):
         return self.from_columns(self.codec.inputs(states, actions), self.codec.targets(next_factors))
 
     def from_columns(self, inputs: Tensor, targets: Tensor) -> Tensor:
-        """Logits [B, O, K] from columns of (s, a) [B, n_inputs] and of the next factors [B, n_columns], bits or probabilities."""
+        """Logits [B, O, K] from columns of (s, a) [B, n_inputs] and next factors [B, n_columns] (bits or probabilities)."""
         codec, n_groups = self.codec, len(self.members)
         columns = torch.cat((inputs, targets), dim=1)
         if len(columns) * self.group_size >= LARGE_GROUP:
@@ -349,7 +349,7 @@ def _columns(cardinalities: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
 
 
 class PlanePredictor(nn.Module):
-    """Two 3x3 convolutions over the planes, each followed by a global maximum that is added at every position.
+    """Two 3x3 convolutions; a linear map of each one's global maxima is added to the next layer at every position.
 
     Borders are represented by zero padding of an additional plane of ones. The action is an input at every position. Each cell
     has a learned residual path to itself. ``terminated`` is computed from the global maxima.
@@ -401,7 +401,7 @@ def cells_of(states: Tensor, layout: PlaneLayout, codec: FactorCodec) -> Tensor:
 
 
 def logits_of(planes: Tensor, end: Tensor, layout: PlaneLayout, codec: FactorCodec) -> Tensor:
-    """Logits [B, O, K] from those of the planes [B, C * K, H, W] (bits: [B, C, H, W]) and of ``terminated`` [B, 1]."""
+    """Logits [B, O, K] combined from logits of planes [B, C * K, H, W] (bits: [B, C, H, W]) and ``terminated`` [B, 1]."""
     values = planes.shape[1] // layout.channels
     split = planes.view(len(planes), layout.channels, values, layout.height, layout.width)
     order = (0, 3, 4, 1, 2) if layout.channels_last else (0, 1, 3, 4, 2)

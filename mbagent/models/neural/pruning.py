@@ -119,7 +119,7 @@ def _absolute(layer: Affine) -> Floats:
 
 
 def _conditioner_sums(conditioner: Conditioner) -> Floats:
-    """Sums from columns of (s, a) and of the next factors to each group's output, [g, n_inputs + n_columns]."""
+    """Sums over paths from columns of (s, a) and the next factors to each group's output, [g, n_inputs + n_columns]."""
     groups = _absolute(conditioner.groups)
     if conditioner.groups.mask is not None:
         groups *= conditioner.groups.mask.numpy()
@@ -130,7 +130,7 @@ def _conditioner_sums(conditioner: Conditioner) -> Floats:
 
 
 def modules(found: Influence) -> list[VariableGroup]:
-    """Independent groups of variables, linked by one-step dependencies; largest first, without isolated variables."""
+    """Independent groups of variables linked by one-step dependencies, largest first; isolated variables are omitted."""
     n = len(found.states)
     links = np.zeros((n, n), dtype=np.bool_)
     links[:, : n - 1] = found.states > 0.0

@@ -131,7 +131,7 @@ def fit_synchronic(planes: PlaneTable, layout: Layout, graphs: Graphs) -> tuple[
 
 
 def _dependent(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[int, Ints]:
-    """For each channel, numbers of the features of kind ``NEXT`` whose errors are correlated with those of its cells."""
+    """For each channel: numbers of earlier-drawn ``NEXT`` features with errors correlated to its own; omitted if none."""
     errors = _errors(planes, layout, graphs)
     found: dict[int, Ints] = {}
     for channel in sorted({c for c, _ in errors}):
@@ -179,7 +179,7 @@ def _errors(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[tuple[in
 def find_mutexes(
     rows: TransitionBatch, board: PlaneLayout, cardinalities: tuple[int, ...], some: TransitionBatch, ones: Floats
 ) -> tuple[Mutex, ...]:
-    """Mutex groups of cells: channels with exactly one cell on, and channels, rows or columns with never more than one on.
+    """Mutex groups of cells: channels with exactly one on; channels, or their rows or columns, with at most one on.
 
     Args:
         rows: all transitions.
@@ -517,7 +517,7 @@ class PlaneGraphModel(LocalGraphModel):
         self.flat, self.fitted = flat, flat.fitted
 
     def _split(self, data: TransitionDataset, seed: int, since: Ints) -> tuple[TransitionBatch, TransitionBatch, Ints]:
-        """As in the base class; both parts are kept until the fit ends, so that both models are compared on the same rows."""
+        """As in the base class; keeps training and held-out rows in the fit, to compare tied and untied models on them."""
         train, held_out, train_since = super()._split(data, seed, since)
         self._parts = train.select(np.arange(train_since.max(), len(train))), held_out  # only rows of the present rules
         return train, held_out, train_since
