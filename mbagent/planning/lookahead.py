@@ -15,6 +15,7 @@ from mbagent.models.mdp import GraphArrays, StateGraph, expand_with
 from mbagent.types import Floats, Ints
 from mbagent_envs.jit import compiled
 from mbagent_envs.random_keys import derive, derive_one, uniform_at
+from mbagent_envs.structs import Struct
 
 LAYER_WIDTH = 32
 """Approximate number of states times samples for each (state, action) in a layer, from which the number of samples follows."""
@@ -24,6 +25,32 @@ ABOUT_AS_LIKELY = 0.5
 
 _GRID = np.uint64(0x5EED)
 _FAR = np.int64(2**62)
+
+
+class Growth(Struct):
+    """State of the expansion around a root, kept between calls of ``grow_around``.
+
+    Attributes:
+        root: its node.
+        begin: number of nodes before the expansion: later ones, and the root, belong to this root.
+        n_samples: number of samples near the root.
+        horizon: maximum number of steps from the root.
+        seed: of the random numbers.
+        reach: probability of each node's most probable path from the root, [room].
+        depth: minimum number of steps to each node, int64 [room].
+        waiting: work space for the unexpanded nodes, int64 [room].
+        chosen: work space for the nodes that are expanded together, int64 [budget].
+    """
+
+    root: int
+    begin: int
+    n_samples: int
+    horizon: int
+    seed: int
+    reach: Floats
+    depth: Ints
+    waiting: Ints
+    chosen: Ints
 
 
 @compiled
@@ -38,13 +65,12 @@ def n_draws(layer: int, n_samples: int) -> int:
 
 
 @compiled
-def _next_batch(graph: GraphArrays, nodes: Ints, n: int, reach: Floats, depth: Ints, budget: int, horizon: int) -> int:
-    """Reorders the unexpanded ``nodes`` [n] so that the next batch to expand comes first; returns the size of the batch.
+def _next_batch(growth: Growth, n: int, budget: int) -> int:
+    """Moves the nodes to expand next to the front of the ``n`` unexpanded nodes; returns their number.
 
-    The batch contains nodes with at least ABOUT_AS_LIKELY times the highest probability, within the budget, by decreasing
-    probability, then depth, then index.
+    These are the nodes with almost the highest probability (ABOUT_AS_LIKELY), sorted by probability, then depth, then number.
     """
-    top = 0.0
+    nodes, reach, depth, horizon, top = growth.waiting, growth.reach, growth.depth, growth.horizon, 0.0
     for i in range(n):
         if depth[nodes[i]] < horizon:
             top = max(top, reach[nodes[i]])
@@ -74,50 +100,31 @@ def _before(node: int, other: int, reach: Floats, depth: Ints) -> bool:
 
 
 @compiled
-def grow_around(
-    kernel: Kernel,
-    work: Any,
-    out: Outcomes,
-    graph: GraphArrays,
-    root: int,
-    begin: int,
-    budget: int,
-    n_samples: int,
-    horizon: int,
-    seed: int,
-    reach: Floats,
-    depth: Ints,
-) -> int:
+def grow_around(kernel: Kernel, work: Any, out: Outcomes, graph: GraphArrays, growth: Growth, budget: int) -> int:
     """Expands the most probable states around a root until the budget is used, or the arrays have no room for the next batch.
 
     Args:
         kernel: the model's arrays.
         work: see ``StateGraph.work_space``.
         out: likewise.
-        graph: the state graph; the root and the nodes from index ``begin`` on belong to this root.
-        root: its node.
-        begin: number of nodes before this root's expansion.
+        graph: the state graph.
+        growth: the root, and what is known of its nodes.
         budget: maximum number of states to expand.
-        n_samples: number of samples near the root.
-        horizon: maximum number of steps from the root.
-        seed: of the random numbers.
-        reach: probability of each node's most probable path from the root, [room]; kept between calls.
-        depth: minimum number of steps to each node, int64 [room]; kept between calls.
 
     Returns:
         the remaining budget; 0 if nothing remains to be expanded.
     """
-    waiting, chosen, n = np.empty(len(graph.tags), dtype=np.int64), np.empty(budget, dtype=np.int64), 0
+    root, waiting, n = growth.root, growth.waiting, 0
     if not graph.expanded[root]:
-        reach[root], depth[root] = 1.0, 0
+        growth.reach[root], growth.depth[root] = 1.0, 0
         waiting[0] = root
         n = 1
-    for node in range(begin, graph.sizes[0]):
+    for node in range(growth.begin, graph.sizes[0]):
         if not graph.expanded[node] and node != root:
             waiting[n] = node
             n += 1
     while budget > 0:
-        size = _next_batch(graph, waiting, n, reach, depth, budget, horizon)
+        size = _next_batch(growth, n, budget)
         if size == 0:
             budget = 0
             break
@@ -125,9 +132,9 @@ def grow_around(
         if graph.sizes[0] + n_needed > len(graph.tags) or graph.sizes[1] + n_needed > len(graph.sources):
             break
         for i in range(size):
-            chosen[i] = waiting[i]
+            growth.chosen[i] = waiting[i]
         n = _drop(waiting, n, size)
-        n = _expand_levels(kernel, work, out, graph, chosen[:size], waiting, n, n_samples, seed, reach, depth)
+        n = _expand_levels(kernel, work, out, graph, growth, size, n)
         budget -= size
     return budget
 
@@ -141,22 +148,11 @@ def _drop(waiting: Ints, n: int, size: int) -> int:
 
 
 @compiled
-def _expand_levels(
-    kernel: Kernel,
-    work: Any,
-    out: Outcomes,
-    graph: GraphArrays,
-    chosen: Ints,
-    waiting: Ints,
-    n: int,
-    n_samples: int,
-    seed: int,
-    reach: Floats,
-    depth: Ints,
-) -> int:
-    """Expands ``chosen`` by increasing depth; appends new nodes to the ``n`` in ``waiting``; returns the new ``n``."""
+def _expand_levels(kernel: Kernel, work: Any, out: Outcomes, graph: GraphArrays, growth: Growth, size: int, n: int) -> int:
+    """Expands the ``size`` chosen nodes by increasing depth; adds new nodes to the ``n`` waiting ones, returns their number."""
+    chosen, reach, depth = growth.chosen[:size], growth.reach, growth.depth
     first_edge, first_node, last = graph.sizes[1], graph.sizes[0], np.int64(-1)
-    for _ in range(len(chosen)):
+    for _ in range(size):
         level, layer = _FAR, 0
         for node in chosen:
             if last < depth[node] < level:
@@ -165,8 +161,8 @@ def _expand_levels(
                 layer += 1
         if layer == 0:
             break
-        draws = n_draws(layer, n_samples)
-        key = derive_one(derive_one(np.uint64(seed), np.uint64(level)), _GRID)
+        draws = n_draws(layer, growth.n_samples)
+        key = derive_one(derive_one(np.uint64(growth.seed), np.uint64(level)), _GRID)
         offset = uniform_at(key, 0)
         for node in chosen:
             if depth[node] == level:
@@ -174,7 +170,7 @@ def _expand_levels(
         last = level
     for node in range(first_node, graph.sizes[0]):
         reach[node], depth[node] = 0.0, _FAR
-        waiting[n] = node
+        growth.waiting[n] = node
         n += 1
     for edge in range(first_edge, graph.sizes[1]):
         if not graph.terminated[edge]:
@@ -287,9 +283,11 @@ def _grow_compiled(graph: StateGraph, roots: NDArray[np.int64], max_states: int,
         while budget > 0:
             n_needed = len(out.probabilities) * min(budget, at_once)
             graph.reserve(n_needed, n_needed)
-            more = len(graph.arrays.tags) - len(reach)
-            reach, depth = np.append(reach, np.zeros(more)), np.append(depth, np.zeros(more, dtype=np.int64))
-            left = grow_around(kernel, work, out, graph.arrays, root, begin, budget, n_samples, horizon, seed, reach, depth)
+            room = len(graph.arrays.tags)
+            reach, depth = np.append(reach, np.zeros(room - len(reach))), np.append(depth, np.zeros(room - len(depth), np.int64))
+            waiting, chosen = np.empty(room, dtype=np.int64), np.empty(budget, dtype=np.int64)
+            growth = Growth(int(root), begin, n_samples, horizon, int(seed), reach, depth, waiting, chosen)
+            left = grow_around(kernel, work, out, graph.arrays, growth, budget)
             if left == budget:  # there was no room for the next batch
                 at_once *= 2
             budget = left
