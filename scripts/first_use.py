@@ -40,7 +40,7 @@ IMPORT = "import time; began = time.process_time(); import {name}; print(time.pr
 def seconds(code: str, folder: Path) -> float:
     """What a program prints last, run in a new process with one thread and a folder for compiled functions."""
     settings = {**os.environ, "NUMBA_CACHE_DIR": str(folder), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run([sys.executable, "-c", code], env=settings, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], env=settings, cwd=folder, capture_output=True, text=True, check=True)
     return float(done.stdout.split()[-1])
 
 

@@ -20,7 +20,7 @@ class Scale(Struct):
 
 @compiled
 def twice(values: "Values", i: int) -> float:
-    return 2.0 * values.table[0, i]
+    return float(2.0 * values.table[0, i])
 
 
 class Values(Struct):
@@ -39,7 +39,7 @@ class Halves(Values):
     @staticmethod
     @compiled
     def weighed(values: "Values", i: int) -> float:
-        return 0.5 * values.table[0, i]
+        return float(0.5 * values.table[0, i])
 
 
 def made(kind: type[Values] = Values) -> Values:
