@@ -31,11 +31,12 @@ NO_GOAL = (
 class PlannerPolicy(BasePolicy):
     """An SB3 policy that chooses actions by planning.
 
-    Its parameters are those of the transition model and of the learned reward; ``state_dict`` and ``load_state_dict``
-    include both, and loading clears all planning caches.
+    The policy's parameters are those of the transition model and of the learned reward. ``state_dict`` and ``load_state_dict``
+    handle both; ``load_state_dict`` also clears all planning caches.
 
-    Several threads may call its methods: each call waits for the previous one (see PlanningLock), so that the results are
-    those of a single thread. Hold ``lock`` around several calls that must not be interleaved with others.
+    Several threads may call the policy's methods: each call waits until the previous call has ended (see PlanningLock), so the
+    results are the same as if a single thread made all calls. Hold ``lock`` around a series of calls that must not be
+    interleaved with others.
 
     Args:
         observation_space: a discrete space (see FactoredSpace).
@@ -44,14 +45,14 @@ class PlannerPolicy(BasePolicy):
         model: the transition model.
         reward_model: the learned reward.
         settings: see PlannerSettings.
-        factored: the factors of the models; None for those of the observation space as declared.
+        factored: the factors that the models use; None for the factors of the declared observation space.
 
     Attributes:
         lock: held while planning, and while reading or changing data that plans depend on.
 
     Raises:
-        ValueError: forecasts="direct" with a planner or a model that does not support it; a time budget or the reuse of trees
-            with a planner that does not support it.
+        ValueError: the settings contain forecasts="direct", and the planner or the model does not support it; or they contain a
+            time budget or tree reuse, and the planner does not support it.
     """
 
     planner_class: ClassVar[type[Planner]] = MctsPlanner
@@ -98,20 +99,20 @@ class PlannerPolicy(BasePolicy):
             self.set_goal(goal if goal is not None else self.goal)
 
     def parts(self) -> tuple[FactoredSpace, TransitionModel, LearnedReward, States, bool]:
-        """The arguments of ``recode`` that restore the present factors and models."""
+        """The arguments with which ``recode`` restores the current factors, models and start states."""
         return self.factored, self.transition_model, self.reward_model, self.start_states, self.fitted
 
     def recode(
         self, factored: FactoredSpace, model: TransitionModel, reward_model: LearnedReward, start_states: States, fitted: bool
     ) -> None:
-        """Replaces factors, models and start states; the goal is removed."""
+        """Replaces factors, models, start states and ``fitted``; removes the goal."""
         with self.lock:
             self.factored, self.transition_model, self.reward_model = factored, model, reward_model
             self.start_states, self.fitted, self.goal = start_states, fitted, None
             self.refresh()
 
     def set_goal(self, goal: Reward | None) -> None:
-        """Sets the goal; with None, ``predict`` raises ValueError."""
+        """Sets the goal; if it is None, ``plan`` raises ValueError."""
         with self.lock:
             self.goal = goal
             if goal is not None:
@@ -122,7 +123,7 @@ class PlannerPolicy(BasePolicy):
 
         Raises:
             ValueError: no goal is known.
-            RuntimeError: called by the reward function, in the middle of a plan.
+            RuntimeError: the reward function called this method during planning.
         """
         with self.lock.planning():
             if self.goal is None:
@@ -141,15 +142,15 @@ class PlannerPolicy(BasePolicy):
         Args:
             observation: one observation of the space, or a batch of them.
             state: returned unchanged (the policy has no memory).
-            episode_start: bool [B]; used only to clear the search tree kept by ``reuse_tree``.
+            episode_start: bool [B]; if any entry is true, the search tree kept by ``reuse_tree`` is cleared.
             deterministic: ignored: the best action is returned in both cases.
 
         Returns:
             (action or batch of actions in the action space's own form, ``state``).
 
         Raises:
-            ValueError: an observation outside the space, or no known goal (see ``NO_GOAL``).
-            RuntimeError: the reward function raised an error, the cause of this one.
+            ValueError: an observation is outside the space, or no goal is known (see ``NO_GOAL``).
+            RuntimeError: the reward function raised an error, which is the ``__cause__`` of this one.
         """
         batch, single = as_batch(self.observation_space, observation)
         with self.lock:
@@ -178,7 +179,7 @@ class PlannerPolicy(BasePolicy):
         return torch.as_tensor(actions)
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, torch.Tensor]:  # type: ignore[override]
-        """Weights of the transition model ("model.…"), of the learned reward ("reward.…"), values of open factors ("space.…")."""
+        """Weights of the transition model ("model.…") and learned reward ("reward.…"); values of open factors ("space.…")."""
         return {name: torch.from_numpy(np.array(value)) for name, value in self.arrays().items()}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -242,13 +243,13 @@ class MctsPolicy(PlannerPolicy):
 
 
 class FlatMonteCarloPolicy(PlannerPolicy):
-    """The paper's basic search: random play after every action (section 4.1)."""
+    """The paper's basic search (section 4.1): each action is evaluated by subsequent random play."""
 
     planner_class = FlatMonteCarlo
 
 
 class ValueIterationPolicy(PlannerPolicy):
-    """Greedy with respect to the optimal values of the MDP generated from the model (section 2)."""
+    """Greedy with respect to the optimal values of the MDP generated from the model (paper, section 2)."""
 
     planner_class = ValueIterationPlanner
 

@@ -54,7 +54,7 @@ LARGEST_REWARD = 1e100
 
 
 class CallableReward:
-    """A user's or an environment's reward function as a function of factors.
+    """Converts a user's or an environment's reward function to a function of factored states.
 
     Args:
         fn: the function.
@@ -62,9 +62,9 @@ class CallableReward:
         actions: the actions.
 
     Raises (when called):
-        TypeError: ``fn`` does not take three arguments, or does not return numbers.
-        ValueError: it returned a wrong shape, NaN, infinity or too large a number.
-        RuntimeError: it raised an error, which is the cause (``__cause__``) of this one.
+        TypeError: ``fn`` does not return numbers; on construction, ``fn`` does not take three arguments.
+        ValueError: ``fn`` returned a wrong shape, NaN, infinity or a number beyond ``LARGEST_REWARD``.
+        RuntimeError: ``fn`` raised an error, which is the ``__cause__`` of this one.
     """
 
     def __init__(self, fn: RewardFn, space: FactoredSpace, actions: ActionEnumeration) -> None:
@@ -123,7 +123,7 @@ _TEST_ROWS = 64
 
 
 def reward_wrapper(env: VecEnv) -> str | None:
-    """Name of a wrapper of the first environment that changes rewards; None if there is none, or in a subprocess."""
+    """Name of the first environment's outermost wrapper that changes rewards; None if there is none, or in a subprocess."""
     inner = getattr(env.unwrapped, "envs", [None])[0]
     while isinstance(inner, gym.Wrapper):
         if isinstance(inner, gym.RewardWrapper | gym.wrappers.NormalizeReward):
@@ -133,19 +133,19 @@ def reward_wrapper(env: VecEnv) -> str | None:
 
 
 class RewardSelector:
-    """Selects the goal from the custom, the environment's and the learned reward.
+    """Selects the goal: the custom reward, the environment's own reward, or the learned reward.
 
-    Without a custom reward, the environment's own ``reward_fn`` is used if there is one and it reproduces all observed
-    rewards (wrappers can change spaces and rewards); else the learned reward, with a warning that gives the reason.
+    Without a custom reward, the goal is the environment's own ``reward_fn`` if it exists and reproduces the rewards observed in
+    that environment (wrappers can change spaces and rewards); rewards from before a change are excepted. Otherwise the goal is
+    the learned reward, and a warning gives the reason.
 
     Args:
         policy: the policy, with its spaces and the learned reward.
         experience: the observed transitions.
 
     Attributes:
-        source: source of the current goal; "missing" after loading an agent whose custom reward was not given
-            again.
-        learned: whether the reward model is fitted to all transitions.
+        source: source of the current goal; "missing" if an agent was loaded without its custom reward.
+        learned: whether the reward model is up to date with the observed transitions.
         reward_report: accuracy of the learned reward; None before it is fitted.
     """
 
@@ -178,7 +178,7 @@ class RewardSelector:
         return self._experience.coded(self._policy.factored)
 
     def recode(self) -> None:
-        """Updates the rewards after a change of the policy's factors."""
+        """Adapts the reward functions to new factors; marks the learned reward as outdated."""
         self._custom, self._environment = (
             None if given is None else self._as_goal(given.fn) for given in (self._custom, self._environment)
         )
@@ -189,10 +189,10 @@ class RewardSelector:
         self.learned = False
 
     def choose(self, reward: RewardFn | None) -> Reward | None:
-        """Changes the goal; ``None`` returns to the environment's own.
+        """Sets the custom reward and returns the new goal; ``None`` removes the custom reward.
 
         Raises:
-            TypeError, ValueError, RuntimeError: the function is not a reward function, or fails; the goal is unchanged.
+            TypeError, ValueError, RuntimeError: ``reward`` is not a reward function, or fails in a test; the goal is unchanged.
         """
         custom = None
         if reward is not None:
@@ -203,7 +203,7 @@ class RewardSelector:
         return self.current()
 
     def current(self) -> Reward | None:
-        """The current goal; None while nothing is learned and no reward is given."""
+        """The current goal; None if the custom reward is missing or the learned reward is not yet available."""
         if self.source == "missing":
             return None
         if self._custom is not None:
@@ -230,7 +230,7 @@ class RewardSelector:
             self._last_warning = message
 
     def restore(self, source: Source) -> Reward | None:
-        """The goal of an agent loaded from a file, which contains only its source; None if it must be given again."""
+        """The goal of a loaded agent, given the ``source`` stored in its file; None if the goal is not available."""
         if source == "custom":
             self.source = "missing"
             return None
@@ -238,7 +238,7 @@ class RewardSelector:
         return self.learned_goal() if source == "learned" else self.current()
 
     def learned_goal(self) -> Reward:
-        """The reward model, which is fitted if necessary."""
+        """Returns the reward model, after fitting it if necessary."""
         self.fit_learned()
         return self._policy.reward_model
 
@@ -253,7 +253,7 @@ class RewardSelector:
             self.learned = True
 
     def _environment_problem(self) -> str | None:
-        """Why the environment's own reward function cannot be used, or None."""
+        """The reason why the environment's own reward function cannot be used; None if it can."""
         if self._environment is None:
             return self._unusable
         rows = self._transitions.rows()
@@ -277,7 +277,7 @@ class RewardSelector:
         return None
 
     def _test(self, reward: CallableReward) -> None:
-        """Tests a reward function on observed transitions, else start states, else the space's first observation."""
+        """Tests ``reward`` on observed transitions; without any, on start states; without these, on all-zero factors."""
         rows = self._transitions.rows()
         if len(rows):
             picked = rows.select(np.linspace(0, len(rows) - 1, min(_TEST_ROWS, len(rows))).astype(np.int64))

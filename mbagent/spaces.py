@@ -1,7 +1,8 @@
 """Encoding of any discrete Gymnasium space as an array of categorical factors (paper 2.1, "factored representations").
 
-A space is flattened into its *elementary* spaces (those inside nested ``Dict`` and ``Tuple`` spaces), and each of these into
-*factors*: a binary variable of the paper is a factor with two values, a ``Discrete(n)`` is one factor with ``n`` values.
+A space is flattened into its *elementary* spaces (those inside nested ``Dict`` and ``Tuple`` spaces), and each elementary space
+is flattened into *factors*. A binary variable of the paper is a factor with two values; a ``Discrete(n)`` is one factor with
+``n`` values.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ Path = tuple[str | int, ...]
 
 
 class OutsideSpaceError(ValueError):
-    """A value that is not one of its space.
+    """Raised for a value outside its space.
 
     Args:
         cause: the problem, as the beginning of a sentence.
-        remedy: advice to the caller who passed the value, as the end of the sentence.
+        remedy: advice to the caller who passed the value, as the end of the same sentence.
 
     Attributes:
-        cause: as given, for messages with another remedy if the value is not the caller's.
+        cause: the argument ``cause``, for messages with another remedy if the caller did not supply the value.
     """
 
     def __init__(self, cause: str, remedy: str) -> None:
@@ -49,7 +50,7 @@ class Leaf:
     """One elementary space, with its path in the nested space and the numbering of its values.
 
     Attributes:
-        path: keys and indices of the space within the nested space.
+        path: keys and indices that lead from the nested space to this one.
         space: the space itself.
         low: each variable's lowest value, int64 [n].
         cardinalities: number of values of each variable, length n.
@@ -75,10 +76,10 @@ class Leaf:
         return f" part {self.name!r}" if self.path else ""
 
     def encode(self, batch: Any, kind: str) -> NDArray[np.int64]:
-        """Numbers int64 [B, n] of a batch of the whole space.
+        """Encodes this part of a batch of the whole space: numbers int64 [B, n].
 
         Raises:
-            OutsideSpaceError: this part is missing, of another shape, or holds a value outside its space.
+            OutsideSpaceError: this part is missing, has the wrong shape, or holds a value outside its space.
         """
         values = np.asarray(_descend(batch, self.path, kind))
         if values.shape[1:] != self.shape or values.ndim == 0:
@@ -109,7 +110,7 @@ class Leaf:
         return numbers
 
     def decode(self, numbers: NDArray[np.int64], wide: bool) -> NDArray[Any]:
-        """Values [B, ...] of numbers int64 [B, n], which are modified; of the space's data type, or int64 if ``wide``."""
+        """Values [B, ...] of ``numbers`` int64 [B, n] (modified), in the space's data type, or as int64 if ``wide``."""
         if self.low.any():
             numbers += self.low
         dtype = np.dtype(np.int64) if wide else np.dtype(self.space.dtype)
@@ -117,10 +118,10 @@ class Leaf:
 
 
 def leaves(space: spaces.Space[Any], kind: str, path: Path = ()) -> Iterator[Leaf]:
-    """The elementary spaces inside ``space``, in its own order.
+    """The elementary spaces inside ``space``, in the order of its parts.
 
     Raises:
-        TypeError: one of them is not discrete; the message names it and a solution.
+        TypeError: an elementary space is not discrete; the message names the space and suggests a solution.
     """
     if isinstance(space, spaces.Dict):
         for key, part in space.spaces.items():
@@ -185,7 +186,7 @@ def _descend(batch: Any, path: Path, kind: str) -> Any:
 
 
 def assemble(space: spaces.Space[Any], parts: Mapping[Path, NDArray[Any]], path: Path = ()) -> Any:
-    """Combines batched values of the elementary spaces, by path, in the form of ``batch_space``."""
+    """Combines batched values of the elementary spaces, keyed by path, into the nested form of ``batch_space``."""
     if isinstance(space, spaces.Dict):
         return {key: assemble(part, parts, (*path, key)) for key, part in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
@@ -205,7 +206,7 @@ MAX_ACTIONS = 4096
 
 @dataclass(frozen=True)
 class PlaneLayout:
-    """Layout of the cells of a stack of planes in a flat vector of factors.
+    """How the cells of a stack of planes are laid out in a flat vector of factors.
 
     Attributes:
         channels: number of planes C.
@@ -229,30 +230,30 @@ class PlaneLayout:
 
 
 class FactoredSpace:
-    """Converts between batches of a discrete space and arrays of factors; the two directions are exact inverses.
+    """Converts batches of a discrete space to factors and back, without loss except for unobserved values of open factors.
 
-    A variable with many declared values (in a Box more than 64, for example 256 in images; else more than 4,096) is
-    *open*: only observed values are numbered. Without ``values`` it has the declared numbers, which are not suitable for
-    models; ``with_values`` returns the space whose open factors have the observed values, in order. Any other value is
-    then replaced by the nearest observed one.
+    An observation variable is *open* if a variable of its elementary space has too many declared values: more than 64 in a Box
+    (images, for example, have 256), more than 4,096 elsewhere. Models need numbers of the observed values only. Without
+    ``values``, open factors keep the declared numbers, which are not suitable for models. ``with_values`` returns a space that
+    numbers each open factor's observed values in ascending order; any other value is then replaced by the nearest observed one.
 
     Args:
         space: Discrete, MultiDiscrete, MultiBinary, integer or boolean Box, or a Dict or Tuple of these, nested to any
             depth.
         kind: word for error messages, "observation" or "action".
-        values: declared numbers of the observed values of each open factor, ascending; None for all declared values.
+        values: for each open factor, its observed values as declared numbers, ascending; None for all declared values.
 
     Attributes:
         space: the space itself.
         cardinalities: number of values of each factor, length F.
         names: a readable name for each factor, length F.
-        open: the open factors, int64 [O].
+        open: indices of the open factors, int64 [O].
         values: as given.
         planes: the layout if the space is one stack of two-dimensional planes, else None.
 
     Raises:
-        TypeError: the space contains a continuous or unsupported part; the message names it and a solution.
-        ValueError: there is no variable, or one has more than ``MAX_CARDINALITY`` observed values.
+        TypeError: the space contains a continuous or unsupported part; the message names the part and suggests a solution.
+        ValueError: the space has no variable, or a variable has more than ``MAX_CARDINALITY`` observed values.
     """
 
     def __init__(
@@ -275,7 +276,7 @@ class FactoredSpace:
         self.cardinalities: tuple[int, ...] = tuple(cardinalities)
 
     def _count_only(self, values: tuple[NDArray[np.int64], ...], cardinalities: list[int]) -> None:
-        """Restricts open factors to the observed values; tabulates the nearest ones if few values are declared."""
+        """Restricts open factors to ``values``; if few values are declared, tabulates the nearest observed one of each."""
         declared = max(cardinalities[factor] for factor in self.open)
         for factor, known in zip(self.open, values, strict=True):
             if len(known) > MAX_CARDINALITY:
@@ -298,8 +299,8 @@ class FactoredSpace:
         """Factors of a batch.
 
         Args:
-            batch: in the form of ``gymnasium.vector.utils.batch_space``: arrays [B, ...], in Dicts and Tuples one per
-                elementary space.
+            batch: in the form of ``gymnasium.vector.utils.batch_space``: one array [B, ...] for each elementary space, nested in
+                Dicts and Tuples like the space.
 
         Returns:
             int64 [B, F].
@@ -310,11 +311,11 @@ class FactoredSpace:
         return self.narrow(np.concatenate([leaf.encode(batch, self.kind) for leaf in self._leaves], axis=1))
 
     def decode(self, factors: NDArray[Any]) -> Any:
-        """The batch of factors [B, F], in the form of ``batch_space`` and in the space's own data types."""
+        """The batch that ``factors`` [B, F] encode, in the form of ``batch_space`` and the space's own data types."""
         return self._decode(factors, integers=False)
 
     def decode_wide(self, factors: NDArray[Any]) -> Any:
-        """As ``decode``, with all integers as int64 (for reward functions, since int8 sums overflow)."""
+        """Like ``decode``, but all integers are int64 (for reward functions, since int8 sums can overflow)."""
         return self._decode(factors, integers=True)
 
     def _decode(self, factors: NDArray[Any], integers: bool) -> Any:
@@ -327,10 +328,10 @@ class FactoredSpace:
         return assemble(self.space, parts)
 
     def with_values(self, numbers: NDArray[Any]) -> FactoredSpace:
-        """The space in which open factors have the observed values.
+        """A space whose open factors have only the observed values.
 
         Args:
-            numbers: observed states, int [N, F], in declared numbers; if N is 0, the lowest values are used.
+            numbers: observed states as declared numbers, int [N, F]; if N is 0, each open factor has only its lowest value.
 
         Raises:
             ValueError: a variable has more than ``MAX_CARDINALITY`` values.
@@ -346,18 +347,18 @@ class FactoredSpace:
         return FactoredSpace(self.space, self.kind, [observed[int(factor)] for factor in self.open])
 
     def same_factors(self, other: FactoredSpace) -> bool:
-        """Whether the factors of both have the same values."""
+        """Whether the open factors of both spaces have the same values."""
         own, others = self.value_arrays(), other.value_arrays()
         return own.keys() == others.keys() and all(np.array_equal(own[name], others[name]) for name in own)
 
     def value_arrays(self) -> dict[str, NDArray[np.int64]]:
-        """The open factors' values, concatenated in "space.values", with their numbers in "space.counts"; empty without any."""
+        """Values of open factors, concatenated ("space.values"), and how many each factor has ("space.counts"); else empty."""
         if self._nearest is None or self.values is None:
             return {}
         return {"space.values": np.concatenate(self.values), "space.counts": np.array([len(known) for known in self.values])}
 
     def from_value_arrays(self, arrays: Mapping[str, NDArray[Any]]) -> FactoredSpace:
-        """The space with these ``value_arrays``; this space if ``arrays`` does not contain them.
+        """The space restored from the ``value_arrays`` in ``arrays``; this space if ``arrays`` does not contain them.
 
         Raises:
             ValueError: the arrays belong to another space.
@@ -370,7 +371,7 @@ class FactoredSpace:
         return FactoredSpace(self.space, self.kind, np.split(values, np.cumsum(counts)[:-1]))
 
     def narrow(self, numbers: NDArray[np.int64]) -> FactorValues:
-        """Factors int64 [B, F] of declared numbers: the nearest observed value, the lower one in a tie."""
+        """Factors int64 [B, F] of declared ``numbers``; open factors take the nearest observed value, the lower one in a tie."""
         if self._nearest is None:
             return numbers
         factors = numbers.copy()
@@ -391,7 +392,7 @@ class FactoredSpace:
 
 
 def _nearest(known: NDArray[np.int64], numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Index of the nearest of ``known`` (ascending) to each number; the lower one in a tie."""
+    """For each number, the index of the nearest value in ``known`` (ascending); the lower one in a tie."""
     above = np.minimum(np.searchsorted(known, numbers), len(known) - 1)
     below = np.maximum(above - 1, 0)
     return np.where(np.abs(numbers - known[below]) <= np.abs(known[above] - numbers), below, above)
@@ -435,7 +436,7 @@ class ActionEnumeration:
         return indices
 
     def decode(self, indices: NDArray[Any]) -> Any:
-        """The batch of actions, in the space's own form, with the numbers ``indices`` [B]."""
+        """The actions with the numbers ``indices`` [B], as a batch in the space's own form."""
         return self.factored.decode(self._factors(indices))
 
     def decode_wide(self, indices: NDArray[Any]) -> Any:
@@ -449,10 +450,10 @@ class ActionEnumeration:
 
 
 def _plane_layout(space: spaces.Space[Any]) -> PlaneLayout | None:
-    """The layout if ``space`` is one stack of planes: two or three dimensions, cells at least 3 by 3.
+    """The layout if ``space`` is one stack of planes (two or three dimensions, planes of at least 3 by 3 cells), else None.
 
-    With three dimensions, if exactly the first two or exactly the last two sizes are equal, the remaining axis is the channel
-    axis; otherwise it is the first axis, unless the last one is strictly smaller.
+    With three dimensions, if either the first two sizes or the last two sizes are equal, but not both, the remaining axis is the
+    channel axis. Otherwise the channel axis is the last axis if it is smaller than the first axis, else the first axis.
     """
     if not isinstance(space, spaces.MultiBinary | spaces.Box | spaces.MultiDiscrete):
         return None
@@ -470,10 +471,10 @@ def _plane_layout(space: spaces.Space[Any]) -> PlaneLayout | None:
 
 
 def as_batch(space: spaces.Space[Any], value: Any, kind: str = "observation") -> tuple[Any, bool]:
-    """An observation (or action) as a batch, and whether it was a single one.
+    """An observation or action ``value`` as a batch, and whether ``value`` was a single one.
 
     Raises:
-        OutsideSpaceError: ``value`` is not numeric, or its shape is neither that of one value of ``space`` nor of a batch.
+        OutsideSpaceError: ``value`` is not numeric, or its shape fits neither one value of ``space`` nor a batch of values.
     """
     if kind == "observation":
         _refuse_returned(space, value)
@@ -510,7 +511,7 @@ def one_as_batch(space: spaces.Space[Any], value: Any, kind: str = "observation"
     """One observation (or action) as a batch of one.
 
     Raises:
-        OutsideSpaceError: ``value`` is not one of ``space``, or is a batch.
+        OutsideSpaceError: ``value`` does not have the form of one value of ``space``.
     """
     batch, single = as_batch(space, value, kind)
     if not single:
@@ -519,7 +520,7 @@ def one_as_batch(space: spaces.Space[Any], value: Any, kind: str = "observation"
 
 
 def _all_single(parts: list[tuple[Any, bool]], kind: str) -> bool:
-    """Whether all parts are single values; OutsideSpaceError if only some are, or if batches differ in length."""
+    """Whether all parts are single values; raises OutsideSpaceError if only some are, or if batches differ in length."""
     if len({single for _, single in parts}) > 1:
         raise OutsideSpaceError(
             f"Some parts of the {kind} are batches and some are not", f"give one {kind}, or a batch of all parts"

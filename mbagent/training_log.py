@@ -14,7 +14,7 @@ from mbagent.models.fit_report import FitReport
 
 
 def check_progress(show: bool) -> None:
-    """Checks that a progress bar can be shown, if requested.
+    """If ``show``, checks that the packages for a progress bar are installed.
 
     Raises:
         ImportError: a package is missing; the message contains the pip command.
@@ -32,7 +32,7 @@ def check_progress(show: bool) -> None:
 
 @contextmanager
 def fit_progress(show: bool) -> Iterator[Callable[[float], None] | None]:
-    """Yields a function that shows a fit's completed share as a bar, None if not ``show``; see ``check_progress``."""
+    """Yields a function that shows a fit's completed share in a bar, or None if ``show`` is false; see ``check_progress``."""
     if not show:
         yield None
         return
@@ -80,9 +80,9 @@ def log_rollout(agent: BaseAlgorithm, began: float, steps_before: int) -> None:
     """Writes the ``rollout/`` and ``time/`` figures to the agent's log.
 
     Args:
-        agent: the agent, with its buffers of episodes.
+        agent: the agent, including its episode buffers.
         began: start time of ``learn``, nanoseconds since the epoch.
-        steps_before: number of environment steps before that.
+        steps_before: number of environment steps before ``learn`` started.
     """
     seconds, logger = max((time.time_ns() - began) / 1e9, 1e-9), agent.logger
     if agent.ep_info_buffer:

@@ -1,4 +1,4 @@
-"""Wrappers that adapt environments to models of single steps."""
+"""Wrappers that adapt environments to one-step models."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from mbagent.spaces import MAX_DECLARED, ActionEnumeration, FactoredSpace
 
 
 class History(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
-    """Makes the last ``k`` observations and actions part of the observation.
+    """Adds the previous ``k`` observations and actions to the observation.
 
-    For environments whose next state depends on more than the current observation: a model of single steps then has the
-    information it needs. A stack of planes remains one, channels first: older observations and one plane for each action become
-    further channels (an action's plane is 1 everywhere, or 0). In any other space, and for planes whose channels would then be
-    mistaken for rows (boards that are not square, with more channels than columns), the observation becomes a vector of
-    variables: those of the observation, then, for each step back, those of the older observation and one bit for each action.
-    Before the first step the older observations are copies of the first one, and all action bits are 0.
+    Use it for environments whose next state depends on more than the current observation; a one-step model then has the
+    information that it needs. A stack of planes remains a stack, channels first. Each step back adds the channels of the older
+    observation and one plane for each action: 1 everywhere for the action taken, else 0 everywhere. The observation becomes a
+    vector if it is not a stack of planes, or if the channels would then be mistaken for rows (boards that are not square, with
+    more channels than columns or as many as rows). The vector contains the variables of the current observation; then, for each
+    step back, those of the older observation and one bit for each action. Before the first step, the older observations are
+    copies of the first one, and all action bits are 0.
 
     Args:
         env: an environment with discrete spaces (see FactoredSpace).
-        k: steps back, at least 1.
+        k: number of steps back, at least 1.
 
     Raises:
         TypeError: a space is not discrete.
@@ -77,7 +78,7 @@ class History(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
         return factors
 
     def _with_history(self) -> NDArray[np.int64]:
-        """The observation with its past, newest first."""
+        """The current observation and its history, newest first."""
         planes = self._planes
         parts = []
         for factors, action in [(self._now, None), *self._past]:
@@ -92,14 +93,14 @@ class History(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
 class Flat(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArgs):
     """Flattens a nested observation to one Dict of all elementary parts.
 
-    SB3's vector environments support Dicts and Tuples, but not nested ones. A part's key is the path to it, separated by
-    dots ("robot.arm", "sensors.0"); an observation that is not nested becomes a Dict of one part, "obs".
+    SB3's vector environments support Dicts and Tuples, but not nested ones. A part's key is its path, joined by dots
+    ("robot.arm", "sensors.0"). An observation that is neither a Dict nor a Tuple becomes a Dict with one part, "obs".
 
     Args:
-        env: an environment with any observation space of Dicts and Tuples.
+        env: an environment; its observation space may nest Dicts and Tuples to any depth.
 
     Raises:
-        ValueError: two paths have the same key.
+        ValueError: two parts would have the same key.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
@@ -125,10 +126,10 @@ class Flat(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArg
 
 
 class Bits(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArgs):
-    """Replaces an observation that is one large number by its binary digits, the highest first.
+    """Replaces an observation that is one large number with the number's binary digits, highest first.
 
-    For a ``Discrete`` space of many values whose binary digits have separate meanings, such as flags packed into one
-    number: a model can then learn each bit separately. If the digits have no meaning, keep the number.
+    Use it for a large ``Discrete`` space if the binary digits of its values have separate meanings, such as flags packed into
+    one number; a model can then learn each bit separately. If the individual digits have no meaning, keep the number.
 
     Args:
         env: an environment whose observation space is Discrete.
@@ -152,13 +153,13 @@ class Bits(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArg
         return ((int(observation) - self._low) >> self._shifts & 1).astype(np.int8)
 
     def number(self, bits: NDArray[Any]) -> NDArray[np.int64]:
-        """The numbers [...] of digits [..., bits]; the inverse of ``observation``."""
+        """The numbers [...] with the binary digits ``bits`` [..., n]; the inverse of ``observation``."""
         weighed: NDArray[np.int64] = (np.asarray(bits, dtype=np.int64) << self._shifts).sum(axis=-1) + self._low
         return weighed
 
 
 def _parts(space: spaces.Space[Any], path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], spaces.Space[Any]]]:
-    """The elementary spaces inside a space, with the paths to them."""
+    """Yields (path, elementary space) for every elementary space inside ``space``."""
     if isinstance(space, spaces.Dict | spaces.Tuple):
         for key, part in space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces):
             yield from _parts(part, (*path, key))
@@ -167,7 +168,7 @@ def _parts(space: spaces.Space[Any], path: tuple[Any, ...] = ()) -> Iterator[tup
 
 
 def _space_of(cardinalities: NDArray[np.int64]) -> spaces.MultiBinary | spaces.MultiDiscrete[Any] | spaces.Box:
-    """The space of variables with these numbers of values; a Box if a variable is open (see FactoredSpace)."""
+    """A space of variables with the given ``cardinalities``; a Box if any variable has more than ``MAX_DECLARED`` values."""
     if (cardinalities == 2).all():
         return spaces.MultiBinary(cardinalities.shape)
     if cardinalities.max() <= MAX_DECLARED:
@@ -176,7 +177,7 @@ def _space_of(cardinalities: NDArray[np.int64]) -> spaces.MultiBinary | spaces.M
 
 
 def _batch(value: Any) -> Any:
-    """A batch of one in the form of ``batch_space``."""
+    """``value`` as a batch of one, in the form of ``batch_space``."""
     if isinstance(value, dict):
         return {key: _batch(part) for key, part in value.items()}
     if isinstance(value, tuple):

@@ -1,6 +1,6 @@
 """Value iteration on state graphs, and the value function of unexpanded states.
 
-The latter is linear in features and in pairs of features.
+The value function is linear in features and in pairs of features.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from mbagent_envs.structs import Struct
 
 
 class LeafValues(Struct):
-    """A sum over the active features of a state and over pairs of them.
+    """Value function: a mean plus the weights of a state's active features and of their pairs.
 
-    Each of the C features is the test whether a factor has one value, other than its commonest.
+    Each of the C features tests whether a factor has one particular value, other than its most common one.
 
     Attributes:
-        common: commonest value of each factor, int64 [F]; empty if nothing was learned: unexpanded states then have the lowest
-            value of the expanded ones.
+        common: most common value of each factor, int64 [F]. If it is empty, nothing was learned; unexpanded states then have the
+            lowest value of the expanded states in their group.
         first: where each factor's values begin in ``column``, int64 [F].
-        column: index of the feature of each value of each factor, -1 for none, int64 [sum of cardinalities].
+        column: feature index of each value of each factor, -1 if the value has no feature, int64 [sum of cardinalities].
         mean: value of a state without active features.
-        weights: of each feature, [C].
-        pairs: weights of pairs of features, symmetric, [C, C]; [0, 0] if pairs are not used.
+        weights: weight of each feature, [C].
+        pairs: symmetric matrix of the weights of feature pairs, [C, C]; shape [0, 0] if pairs are not used.
         low: lower bound of values.
         high: upper bound of values.
     """
@@ -53,7 +53,7 @@ LOWEST_KNOWN = LeafValues(_NOTHING, _NOTHING, _NOTHING, 0.0, np.zeros(0), np.zer
 
 @compiled
 def features_on(leaf: LeafValues, state: Ints, on: Ints) -> int:
-    """Writes the active features of a state [F] to ``on`` [F]; returns their number."""
+    """Writes the indices of a state's active features to the start of ``on`` [F]; returns how many there are."""
     n = 0
     for f in range(len(state)):
         if state[f] != leaf.common[f]:
@@ -85,7 +85,7 @@ def leaf_value(leaf: LeafValues, state: Ints) -> float:
 
 @compiled
 def evaluate(leaf: LeafValues, states: Ints, skipped: Bools, v: Floats) -> None:
-    """Writes the values of states [N, F] that are not ``skipped`` to ``v`` [N]; does nothing for LOWEST_KNOWN."""
+    """Writes the values of ``states`` [N, F] to ``v`` [N], except where ``skipped`` [N]; does nothing for LOWEST_KNOWN."""
     if len(leaf.common) > 0:
         for node in range(len(v)):
             if not skipped[node]:
@@ -108,10 +108,10 @@ class Values:
     """Solution of a state graph for a goal.
 
     Attributes:
-        v: float64 [N], value of each state with the best action; of unexpanded states by ``leaf`` or ``frontier``.
+        v: float64 [N], value of each state: that of the best action if expanded, else that given by ``leaf`` or ``frontier``.
         q: float64 [N, A], value of each action; zero rows for unexpanded states.
         rewards: float64 [M], reward of every successor edge.
-        frontier: float64 [G], value of unexpanded states in each group, if ``leaf`` is LOWEST_KNOWN.
+        frontier: float64 [G], value of each group's unexpanded states; used only if ``leaf`` is LOWEST_KNOWN.
         leaf: learned values of unexpanded states.
     """
 
@@ -123,7 +123,7 @@ class Values:
 
 
 def score_edges(graph: StateGraph, goal: Reward, start: int = 0) -> Floats:
-    """Rewards [M - start] of the graph's successor edges from number ``start`` on, in one call of the goal."""
+    """Rewards [M - start] of the graph's successor edges ``start`` ... M - 1, from one call of ``goal``."""
     if graph.n_edges == start:
         return np.zeros(0)
     sources, next_nodes = graph.sources[start:], graph.next_nodes[start:]
@@ -134,16 +134,16 @@ def score_edges(graph: StateGraph, goal: Reward, start: int = 0) -> Floats:
 def solve(graph: StateGraph, goal: Reward, gamma: float, n_groups: int = 1, leaf: LeafValues = LOWEST_KNOWN) -> Values:
     """Value iteration from scratch.
 
-    Unexpanded states have the values of ``leaf``; with LOWEST_KNOWN, the lowest value of the expanded states of their group,
-    which is determined together with the values. With zero, all costs and income would end at the unexpanded states; with
-    the mean, these could be more attractive than a reward after which few states are expanded, and the agent would walk
-    around for ever.
+    Unexpanded states have the values of ``leaf``. With LOWEST_KNOWN, they have the lowest value of the expanded states in their
+    group; it is updated in every sweep. If unexpanded states had value zero instead, costs and income would seem to end there.
+    If they had the mean value, they could be more attractive than a reward after which few states are expanded; the agent would
+    then wander for ever.
 
     Args:
         graph: the state graph.
         goal: reward function.
         gamma: discount, below one.
-        n_groups: groups of the graph are numbered 0 ... n_groups - 1.
+        n_groups: number of groups in the graph, indexed 0 ... n_groups - 1.
         leaf: learned values of unexpanded states.
     """
     zeros = np.zeros((len(graph), graph.model.n_actions))
@@ -157,11 +157,12 @@ def solve(graph: StateGraph, goal: Reward, gamma: float, n_groups: int = 1, leaf
 def settle(graph: StateGraph, values: Values, gamma: float, max_sweeps: int = MAX_SWEEPS, only: Bools | None = None) -> None:
     """In-place value iteration that starts from the given values.
 
-    Gauss-Seidel updates, last node first: without cycles, one sweep suffices if every node was added before its successors.
+    Gauss-Seidel updates, last node first. If the graph has no cycles, nodes precede their successors and the values of
+    unexpanded states are fixed, one sweep suffices.
 
     Args:
         graph: the state graph.
-        values: initial values; updated.
+        values: initial values, updated in place.
         gamma: discount.
         max_sweeps: maximum number of sweeps.
         only: bool [G], the groups to update; None for all.
@@ -172,7 +173,7 @@ def settle(graph: StateGraph, values: Values, gamma: float, max_sweeps: int = MA
 
 @compiled
 def bellman(node: int, graph: GraphArrays, rewards: Floats, gamma: float, v: Floats, q: Floats) -> float:
-    """Sets row ``node`` of ``q`` [N, A] from the values ``v`` [N] of its successors, and returns its greatest value."""
+    """Sets row ``node`` of ``q`` [N, A] from the successors' values in ``v`` [N]; returns the maximum of the row."""
     best = -np.inf
     for a in range(q.shape[1]):
         total = 0.0
@@ -196,7 +197,7 @@ def _still_active(active: Bools, moved: Floats, tolerance: float, scale: Floats)
 
 @compiled
 def _set_frontier(graph: GraphArrays, active: Bools, lows: Floats, moved: Floats, v: Floats, frontier: Floats) -> None:
-    """Sets the unexpanded states of every active group to the lowest value of its expanded ones; updates the last three."""
+    """Gives unexpanded states of active groups the group's lowest expanded value; updates ``moved``, ``v``, ``frontier``."""
     for g in range(len(frontier)):
         if active[g]:
             moved[g] = max(moved[g], abs(lows[g] - frontier[g]))
@@ -219,9 +220,9 @@ def sweep(
     frontier: Floats,
     leaf: LeafValues,
 ) -> None:
-    """Sweeps over the ``active`` groups (overwritten); updates ``v``, ``q`` and ``frontier`` (see Values).
+    """Sweeps over the ``active`` groups [G]; updates ``v``, ``q`` and ``frontier`` (see Values) and overwrites ``active``.
 
-    ``rewards``, ``v`` and ``q`` are as long as the graph has edges and nodes in use.
+    ``rewards`` has one entry for each edge in use; ``v`` and ``q`` have one row for each node in use.
     """
     # Every group has its own stopping criterion: its values must not depend on the other groups of the same call.
     n_groups = len(frontier)
@@ -252,15 +253,15 @@ def sweep(
 def break_ties(graph: StateGraph, q: Floats, roots: Ints, gamma: float) -> Floats:
     """Action scores [R, A]: Q-values, with ties broken in favour of actions that reach unexpanded states sooner.
 
-    If all actions in the graph are equally good, rewards can only be found outside of it. Among optimal policies the score
-    prefers the one that reaches unexpanded states soonest; without this, an agent that sees no reward would repeat its first
-    action for ever.
+    If all actions in the graph are equally good, rewards can only be found outside the graph. Among optimal policies, the scores
+    prefer the one that reaches unexpanded states soonest. Otherwise, an agent that sees no reward would repeat the first action
+    for ever.
 
     Args:
         graph: the state graph.
-        q: float64 [N, A], values of its actions.
+        q: float64 [N, A], values of all nodes' actions.
         roots: int64 [R], nodes to score.
-        gamma: discount, here of the steps until an unexpanded state.
+        gamma: discount, here for each step until an unexpanded state.
     """
     scores = q[roots].copy()
     top = scores.max(axis=1, keepdims=True)
@@ -277,7 +278,7 @@ def break_ties(graph: StateGraph, q: Floats, roots: Ints, gamma: float) -> Float
 
 @compiled
 def _reach_unexpanded(graph: GraphArrays, q: Floats, tie: float, gamma: float, max_sweeps: int, reach: Floats) -> None:
-    """Fills ``reach`` [N, A]: maximum discounted probability of reaching an unexpanded state by policies optimal for ``q``."""
+    """Fills ``reach`` [N, A]: greatest discounted probability that a policy optimal for ``q`` reaches an unexpanded state."""
     n_groups = 0
     w = np.zeros(len(q))
     for s in range(len(q)):
@@ -315,8 +316,9 @@ SLIGHT = 1e-3
 def doubt(graph: StateGraph, values: Values, gamma: float) -> Floats | None:
     """Possible error of each action's value [N, A] due to merged rare outcomes; None if no outcomes were merged.
 
-    For each step it is the probability of the outcomes left out times the range of all values, as if their values were as extreme
-    as those of the others; later steps follow the best policy. Also None if all errors are below ``SLIGHT`` of that range.
+    The error of one step is the probability of the merged outcomes times the range of the values of all outcomes in the group;
+    it is assumed that the merged outcomes also lie in this range. The discounted errors of later steps under the best policy are
+    added. Also None if no error exceeds ``SLIGHT`` of the largest range.
     """
     if not graph.left_out.any():
         return None
@@ -350,7 +352,7 @@ def _add_later_doubt(graph: GraphArrays, q: Floats, gamma: float, first: Floats,
 
 
 def undecided(scores: Floats, q: Floats, bounds: Floats) -> Bools:
-    """Rows [R] in which another action than the chosen one could be best, given errors ``bounds`` of the values ``q`` [R, A]."""
+    """Rows [R] in which an unchosen action with a bound above 0 could be best; ``bounds`` [R, A]: errors of values ``q``."""
     rows, best = np.arange(len(q)), best_actions(scores)
     rivals = q + bounds > (q - bounds)[rows, best][:, None]
     rivals[rows, best] = False
@@ -368,12 +370,12 @@ class SolvedMdp:
         model: transition model.
         start: int64 [B, F], start states.
         max_states: if more states are reachable, ``graph`` is None.
-        n_samples: samples for a (state, action) with too many successors to enumerate; more in small MDPs.
-        seed: of the random numbers of these samples.
+        n_samples: number of samples for each (state, action) with too many successors to enumerate; small MDPs get more.
+        seed: random seed of these samples.
 
     Attributes:
         graph: the reachable MDP, or None.
-        values: its solution for the last goal, or None.
+        values: solution of the MDP for the last goal, or None.
         bounds: see ``doubt``.
     """
 
@@ -395,7 +397,7 @@ class SolvedMdp:
             self.bounds = doubt(self.graph, self.values, gamma)
 
     def find(self, states: States) -> NDArray[np.int64]:
-        """Nodes [B] of states [B, F]; -1 for states that the graph does not contain or that are not expanded."""
+        """Node of each state [B, F], int64 [B]; -1 if the state is not in the graph or not expanded."""
         if self.graph is None:
             return np.full(len(states), -1, dtype=np.int64)
         nodes = self.graph.find(states)
@@ -403,7 +405,7 @@ class SolvedMdp:
 
 
 def _affordable(graph: StateGraph, n_samples: int) -> int:
-    """Number of samples for each (state, action) that DRAWS allows for an MDP of this size, if it is stochastic."""
+    """Samples for each (state, action): if ``graph`` is stochastic, as many as DRAWS allows; at least ``n_samples``."""
     if n_samples >= MOST_SMALL_SAMPLES or graph.counts.max(initial=0) <= 1:
         return n_samples
     n_affordable = DRAWS // max(graph.counts.size, 1)
