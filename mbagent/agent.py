@@ -64,9 +64,9 @@ class ModelLearningAgent(EnvironmentAlgorithm):
     ``learn`` explores, records transitions and fits a transition model (paper section 3). ``predict`` plans
     with the model (section 4) for the current goal: the environment's own reward, or the function given to ``set_reward``.
 
-    Several threads may call ``predict``, ``explain``, ``set_reward``, ``save`` and ``get_parameters`` of one agent while
-    another thread is in ``learn``, ``prune`` or ``set_parameters``: conflicting calls wait for each other, so results are
-    those of one call after the other. To plan in parallel, give each thread or process a copy (``copy.deepcopy(agent)``).
+    Several threads may call ``predict``, ``explain``, ``set_reward``, ``save`` and ``get_parameters`` of one agent while another
+    thread is in ``learn``, ``prune`` or ``set_parameters``: conflicting calls wait for each other, so the results are as if they
+    had run one after the other. To plan in parallel, give each thread or process a copy (``copy.deepcopy(agent)``).
 
     Args:
         policy: the planner: "MctsPolicy" (also "MlpPolicy", "CnnPolicy", "MultiInputPolicy"), "FlatMonteCarloPolicy",

@@ -297,7 +297,7 @@ def _evidence(k: Ints, n: Ints, all_k: Ints | None = None, all_n: Ints | None = 
 
 
 def _factor_evidence(logs: Floats) -> Floats:
-    """Log evidence [G] that a factor depends on a condition: maximum of ``logs`` [C, G], or a mixture of all if larger."""
+    """Log evidence [G] that a factor depends on a condition: from its best change in ``logs`` [C, G] or, if more, all."""
     together = np.logaddexp(math.log(1.0 - LEAST_SHARE), math.log(LEAST_SHARE) + logs).sum(axis=0)
     result: Floats = np.maximum(logs.max(axis=0), together)
     return result

@@ -408,7 +408,7 @@ class DirectedExploration:
             self.table = None
 
     def _keep(self, kept: list[_Steps]) -> None:
-        """Keeps steps for later tests; if they exceed MANY_VALUES, runs a last test and discards them all."""
+        """Keeps steps for later tests; if they hold more than MANY_VALUES values, runs a last test and discards all steps."""
         kept.append(_joined(self._unkept).narrowed())
         self._unkept, self._n_unkept = [], 0
         self._n_kept += 2 * kept[-1].states.size

@@ -32,7 +32,7 @@ class ModelError:
     Attributes:
         model: the model.
         members: models fitted to the same data, each with a different part left out.
-        doubts: doubts at the points of the calibration curve, ascending, [K].
+        doubts: values of ``doubt`` at the points of the calibration curve, ascending, [K].
         rates: frequency of wrong predictions at these doubts, [K].
     """
 

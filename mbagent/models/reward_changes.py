@@ -104,7 +104,7 @@ def _gains(groups: Ints, labels: Ints, n_distinct: Ints) -> Floats:
 
 
 def _ranks(labels: Ints) -> tuple[Ints, Ints]:
-    """Numbers of earlier and later rows with each row's label, int [N] each."""
+    """For each row, how many earlier and how many later rows have the same label, int [N] each."""
     order, counts = np.argsort(labels, kind="stable"), np.bincount(labels)
     rank = np.empty(len(labels), dtype=np.int64)
     rank[order] = np.arange(len(labels)) - (np.cumsum(counts) - counts)[labels[order]]

@@ -315,7 +315,7 @@ class _Search:
         return float(size * np.log(len(self.items.kind)) - gammaln(size + 1.0))
 
     def _pattern(self, items: Items) -> Pattern:
-        """Items as a pattern, with numbers of observed and expected rows."""
+        """Pattern of ``items``, with observed and expected numbers of rows with all items."""
         shown, chances = _unexpected(self.table, items)
         observed = int((shown.all(axis=1) & self.free).sum())
         independent = expected = float(chances.astype(np.float64).prod(axis=1).sum())

@@ -201,7 +201,7 @@ class DecisionGraphModel(GraphPredictions):
         return True
 
     def _redrawn(self, resets: Bools, events: Bools, patterns: Sequence[Pattern]) -> Resets:
-        """Combines resets and joint events; if there are any resets, all factors and ``terminated`` are redrawn."""
+        """Resets and joint events as one ``Resets``; redraws everything if there are any resets, else the patterns' factors."""
         own = factors_of(self.fitted, patterns) | resets.any()
         return Resets(resets | events, own, jointly=len(patterns) > 1 or bool(resets.any()))
 

@@ -70,7 +70,7 @@ def number_strings(strings: Actions, n_actions: int) -> Actions:
 
 
 def longest_string(n_actions: int) -> int:
-    """Length of the longest strings that can be numbered. With only one action there is no limit, and the result is 1000."""
+    """Maximum length of a string of actions in ``number_strings``; 1000 with only one action, which sets no limit."""
     n = 1
     while n_actions > 1 and n_actions ** (n + 1) <= LARGEST_NUMBER:
         n += 1

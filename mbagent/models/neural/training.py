@@ -188,14 +188,14 @@ def losses(codec: FactorCodec, logits: Tensor, outcomes: Tensor, loss: Loss) -> 
 
 
 class Trainer:
-    """Fits a predictor, then a conditioner, to examples; or both to one observation at a time.
+    """Fits a predictor, then a conditioner, to examples; or updates both on-line, by one gradient step per call.
 
     The conditioner's loss has no gradient with respect to the predictor, which can therefore be fitted first; the conditioner
     then corrects a fixed predictor.
 
     Args:
         codec: the factors.
-        predictor: any predictor body.
+        predictor: a ``networks.Predictor``.
         conditioner: None, or the conditioner.
         config: see TrainingConfig.
     """

@@ -77,7 +77,7 @@ def _predicted(pair: Pair, inputs: Tensor, outputs: slice) -> Tensor:
 
 
 def chances(pair: Pair, columns: Tensor, i: int) -> Tensor:
-    """P(bit i = 1) [N] from columns of state, action and outcome [N, n_inputs + O], as in ``sampling.sample_causal``."""
+    """P(bit i = 1) [N] by the rule of ``sampling.sample_causal``; columns: state, action, outcome, [N, n_inputs + O]."""
     n_inputs, conditioner = pair.predictor.codec.n_inputs, pair.conditioner
     logit = _predicted(pair, columns[:, :n_inputs], slice(i, i + 1))[:, 0]
     chance = torch.sigmoid(logit.double())
@@ -219,7 +219,7 @@ class Table(NamedTuple):
     chances: Floats
 
     def simplified(self, chances: Floats) -> Table:
-        """The table with other probabilities, without parents that make no difference."""
+        """The table with ``chances`` as its probabilities, without the parents that do not affect them."""
         if len(chances) > 1 and (chances == chances[:1]).all():
             chances = chances[:1]
         bits, n_states = [*self.states, *self.others], len(self.states)
@@ -267,7 +267,7 @@ def _copy(state: Ints, copies: Ints, values: Ints) -> None:
 
 @inlined
 def _by_state(r: int, action: int, state: Ints, bits: Ints, parents: Ints) -> tuple[int, int]:
-    """Index in the table of row r, as far as it is determined by action and state; and the stride of the next parent."""
+    """For row r of ``bits``: the part of the table index due to action and state, and the stride of the next parent."""
     place, weight = bits[r, 1] + bits[r, 2] * action, 1
     for v in range(bits[r, 3], bits[r, 4]):
         place += weight * state[parents[v]]

@@ -216,7 +216,7 @@ def refine(planes: PlaneTable, asked: Sequence[Question], found: list[Search]) -
 
     Args:
         planes: the transitions.
-        asked: the questions about channels.
+        asked: Questions whose variables are channels.
         found: each question's search on the sample.
 
     Returns:

@@ -131,7 +131,7 @@ def fit_synchronic(planes: PlaneTable, layout: Layout, graphs: Graphs) -> tuple[
 
 
 def _dependent(planes: PlaneTable, layout: Layout, graphs: Graphs) -> dict[int, Ints]:
-    """For each channel: numbers of earlier-drawn ``NEXT`` features with errors correlated to its own; omitted if none."""
+    """For each channel, indices of earlier-drawn ``NEXT`` features whose errors correlate with its own; no entry if none."""
     errors = _errors(planes, layout, graphs)
     found: dict[int, Ints] = {}
     for channel in sorted({c for c, _ in errors}):
