@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from numbers import Integral
 from typing import Any, cast, dataclass_transform
 
 import numba
@@ -132,20 +133,19 @@ _TYPES: dict[Any, StructType] = {}
 """All types of structs; equal ones are one object."""
 
 
-def _type_of(value: Any) -> Any:
+def _member(value: Any) -> tuple[Any, list[int]]:
+    """Type of an attribute's value in compiled code, and its words; a type of None if no struct can have it."""
     if isinstance(value, np.ndarray):
-        return types.Array(numba.from_dtype(value.dtype), value.ndim, "C")
+        return types.Array(numba.from_dtype(value.dtype), value.ndim, "C"), [value.ctypes.data, *value.shape]
     if isinstance(value, Struct):
-        return value._numba_type_
-    return types.float64 if isinstance(value, float) else types.uint64 if isinstance(value, np.uint64) else types.int64
-
-
-def _words_of(value: Any) -> list[int]:
-    if isinstance(value, np.ndarray):
-        return [value.ctypes.data, *value.shape]
-    if isinstance(value, Struct):
-        return [value._address]
-    return [int(np.float64(value).view(np.uint64)) if isinstance(value, float) else int(value) % 2**64]
+        return value._numba_type_, [value._address]
+    if isinstance(value, float):
+        return types.float64, [int(np.float64(value).view(np.uint64))]
+    if isinstance(value, np.uint64):
+        return types.uint64, [int(value)]
+    if isinstance(value, Integral | np.bool_):
+        return types.int64, [int(value) % 2**64]
+    return None, []
 
 
 @dataclass_transform(frozen_default=True)
@@ -156,6 +156,7 @@ class Struct:
     booleans are integers.
 
     Raises:
+        TypeError: an attribute's value is none of these.
         ValueError: an array is not contiguous.
     """
 
@@ -173,16 +174,20 @@ class Struct:
         members = []
         for name in type(self)._names():
             value = getattr(self, name)
+            kind, its_words = _member(value)
+            if kind is None:
+                raise TypeError(
+                    f"{type(self).__name__}.{name} has to be an array, a float, an integer or a struct, not {value!r}."
+                )
             if isinstance(value, np.ndarray) and not value.flags.c_contiguous:
                 raise ValueError(f"{type(self).__name__}.{name} has to be a contiguous array.")
-            words += _words_of(value)
-            members.append((name, _type_of(value)))
+            words += its_words
+            members.append((name, kind))
         key = (type(self), tuple(members))
-        if key not in _TYPES:
-            _TYPES[key] = StructType(*key)
+        made = _TYPES.get(key) or _TYPES.setdefault(key, StructType(*key))
         stored = np.asarray(words, dtype=np.uint64)
-        for name, made in (("_words", stored), ("_address", stored.ctypes.data), ("_numba_type_", _TYPES[key])):
-            object.__setattr__(self, name, made)
+        for name, value in (("_words", stored), ("_address", stored.ctypes.data), ("_numba_type_", made)):
+            object.__setattr__(self, name, value)
 
     @classmethod
     def _names(cls) -> list[str]:

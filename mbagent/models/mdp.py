@@ -114,7 +114,7 @@ def expand_with(
 
 
 def most_outcomes(n_actions: int, n_samples: int) -> int:
-    """Maximum number of outcomes of a state; see ``kernel.outcomes``."""
+    """Maximum number of outcomes of a state; see ``models.kernel.Kernel.outcomes``."""
     return 2 * n_actions * max(n_samples, 2)
 
 

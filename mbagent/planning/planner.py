@@ -138,7 +138,10 @@ class Plan:
 
 
 class Planner(Protocol):
-    """Chooses actions by simulations with a model; the plan is a pure function of (settings, model, goal, root).
+    """Chooses actions by simulations with a model.
+
+    The plan is a pure function of (settings, model, goal, root) except with ``reuse_tree``, where it also depends on the decision
+    before, and with ``time_budget``, where it also depends on the machine's speed.
 
     Planners that can also return a plan's state graph implement ``trajectories.TracingPlanner``.
     """

@@ -84,7 +84,7 @@ class ValueIterationPlanner:
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
-        """Takes the settings; a model and a goal must follow."""
+        """Stores the settings; set a model and a goal before planning."""
         self.settings = settings
         self._model: TransitionModel | None = None
         self._goal: Reward | None = None
@@ -248,7 +248,7 @@ class MctsPlanner(ValueIterationPlanner):
     """
 
     def __init__(self, settings: PlannerSettings) -> None:
-        """Takes the settings; a model and a goal must follow."""
+        """Stores the settings; set a model and a goal before planning."""
         super().__init__(settings)
         self._last: _Search | None = None
         self._spare: StateGraph | None = None

@@ -128,3 +128,9 @@ def test_copies_have_arrays_of_their_own(copied: Any) -> None:
 def test_arrays_that_are_not_contiguous_are_refused() -> None:
     with pytest.raises(ValueError, match=r"Scale\.offsets has to be a contiguous array"):
         Scale(1.0, np.arange(6)[::2])
+
+
+@pytest.mark.parametrize("value", [np.float32(1.5), None, "1.5", [1.5], 1j])
+def test_values_that_no_struct_can_have_are_refused(value: Any) -> None:
+    with pytest.raises(TypeError, match=r"Scale\.factor has to be an array, a float, an integer or a struct, not"):
+        Scale(value, np.arange(6))

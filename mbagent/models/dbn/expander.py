@@ -256,7 +256,7 @@ class GraphKernel(AffectedIndex):
 
 @work_for.register
 def graph_work(g: GraphKernel, n_grid: int) -> GraphWork:
-    """See ``kernel.work_for``."""
+    """See ``models.kernel.work_for``."""
     layout = g.layout
     n_variables, n_factors, n_mutexes = len(layout.outputs), layout.n_factors, len(layout.exactly)
     width, most = n_variables + n_mutexes, max(int(layout.outputs.max()), n_variables) + 1

@@ -299,7 +299,7 @@ class WholeKernel(Struct):
 
 
 def kernel_of(fitted: Fitted, cardinalities: tuple[int, ...]) -> GraphKernel | WholeKernel:
-    """The kernel of fitted graphs for planning: an ``GraphKernel`` if possible, else a ``WholeKernel``."""
+    """The kernel of fitted graphs for planning: a ``GraphKernel`` if possible, else a ``WholeKernel``."""
     if not fitted.has_reset and only_end_is_synchronic(fitted.layout, fitted.synchronic):
         return GraphKernel.of(fitted.layout, fitted.usual, fitted.synchronic, cardinalities)
     f = fitted
@@ -308,7 +308,7 @@ def kernel_of(fitted: Fitted, cardinalities: tuple[int, ...]) -> GraphKernel | W
 
 @work_for.register
 def whole_work(kernel: WholeKernel, n_grid: int) -> WholeWork:
-    """See ``kernel.work_for``."""
+    """See ``models.kernel.work_for``."""
     k, layout = kernel, kernel.layout
     return WholeWork(
         row_work(layout, k.usual, k.synchronic, n_grid),
