@@ -20,14 +20,15 @@ from numba.core import cgutils, types
 from numba.core.caching import FunctionCache
 from numba.extending import intrinsic
 
+from mbagent_envs.callees import link_callees
+
 _F = TypeVar("_F", bound=Callable[..., Any])
 _T = TypeVar("_T")
-_njit = cast("Any", numba.njit)  # the stubs lack an option: a wrapper that nothing here needs is not compiled
 
 
 def compiled(function: _F) -> _F:
     """Compile a function of numbers and arrays; the uncompiled function is available as ``function.py_func``."""
-    return _with_cache(_njit(nogil=True, no_cfunc_wrapper=True)(function), function)
+    return _compiled(function, {})
 
 
 def vectorised(function: _F) -> _F:
@@ -37,18 +38,15 @@ def vectorised(function: _F) -> _F:
     may be added without intermediate rounding; and division by zero raises no error. Arrays must have a contiguous type, which
     those unpacked by ``a, b = np.empty((2, n))`` do not have.
     """
-    fast = {"reassoc", "contract", "nsz"}
-    return _with_cache(_njit(nogil=True, no_cfunc_wrapper=True, error_model="numpy", fastmath=fast)(function), function)
+    return _compiled(function, {"error_model": "numpy", "fastmath": {"reassoc", "contract", "nsz"}})
 
 
-def _with_cache(dispatcher: Any, function: _F) -> _F:
-    """The dispatcher, with a cache on disk that depends on the hash of the sources."""
+def _compiled(function: _F, options: dict[str, Any]) -> _F:
+    """A function compiled with options of numba, and a cache on disk that depends on the hash of the sources."""
+    options = {**options, "nogil": True, "no_cfunc_wrapper": True}
+    dispatcher = cast("Any", numba.njit)(**options)(function)
     if hasattr(dispatcher, "enable_caching"):  # a plain function if NUMBA_DISABLE_JIT is set
-        # Numba would compile a function again for each constant passed to it, and for the first value of a loop's variable.
-        resolve, plain = dispatcher.get_call_template, cast("Any", types.unliteral)
-        dispatcher.get_call_template = lambda args, kws: resolve(
-            [plain(kind) for kind in args], {name: plain(kind) for name, kind in kws.items()}
-        )
+        link_callees(dispatcher, function, options)
         try:
             dispatcher._cache = _Cache(function)
         except RuntimeError as error:  # numba found no writable folder

@@ -4,12 +4,15 @@ import os
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from importlib import util
 from pathlib import Path
 from typing import Any
 
 import pytest
+from numba.core import event
+from numba.core.caching import NullCache
 
 from mbagent_envs import jit
 
@@ -111,8 +114,51 @@ def _sum_of_next(n: int) -> int:
     return total
 
 
-@pytest.mark.skipif(not hasattr(_next, "signatures"), reason="compilation is disabled")
-def test_a_function_is_not_compiled_again_for_constants() -> None:
-    assert _sum_of_next(2) == 15
-    dispatcher: Any = _next
-    assert len(dispatcher.signatures) == 1
+@jit.compiled
+def _checked(n: int) -> int:
+    if n < 0:
+        raise ValueError("negative", n)
+    if n < 2:
+        return 1
+    return n * _checked(n - 1)
+
+
+@jit.compiled
+def _binomial(n: int, k: int) -> int:
+    return int(_checked(n) // (_checked(k) * _checked(n - k)))
+
+
+def compilations(call: Callable[[], Any]) -> Counter[str]:
+    """Names of the functions that are compiled during a call."""
+    with event.install_recorder("numba:compile") as recorder:
+        call()
+    started = [found for _, found in recorder.buffer if found.is_start]
+    return Counter(found.data["dispatcher"].py_func.__name__ for found in started)
+
+
+needs_compilation = pytest.mark.skipif(not hasattr(_next, "signatures"), reason="compilation is disabled")
+
+
+@needs_compilation
+def test_a_function_is_not_compiled_again_for_constants(monkeypatch: pytest.MonkeyPatch) -> None:
+    sum_of_next: Any = _sum_of_next
+    monkeypatch.setattr(sum_of_next, "_cache", NullCache())
+    assert compilations(lambda: sum_of_next(2)) == {"_sum_of_next": 1, "_next": 1}
+    assert sum_of_next(2) == 15
+
+
+@needs_compilation
+def test_a_function_called_by_compiled_code_alone_has_no_machine_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    for function in (_binomial, _checked):
+        monkeypatch.setattr(function, "_cache", NullCache())
+    checked: Any = _checked
+    assert _binomial(6, 2) == 15
+    assert not checked.signatures
+    assert checked(5) == 120
+    assert len(checked.signatures) == 1
+
+
+def test_errors_pass_through_functions_that_are_linked_in() -> None:
+    with pytest.raises(ValueError, match="negative") as error:
+        _binomial(2, 3)
+    assert error.value.args == ("negative", -1)
