@@ -44,13 +44,35 @@ class _Unoptimised:
 def link_callees(dispatcher: Any, function: Callable[..., Any], options: dict[str, Any]) -> None:
     """Lets compiled code call a function without machine code of its own.
 
-    Numba would also compile a function again for each constant passed to it, and for the first value of a loop's variable; here,
-    constants count as any other value.
-
     Args:
         dispatcher: the compiled function for calls from Python; changed.
         function: the same function, uncompiled.
         options: of numba's compiler.
+    """
+    made: list[Any] = []
+    add = dispatcher.add_overload
+
+    def callee() -> Any:
+        if not made:
+            made.append(_callee(function, options))
+            made[0]._compiling_counter = dispatcher._compiling_counter  # by which numba notices recursion
+        return made[0]
+
+    def add_with_environments(compiled: Any) -> None:
+        for environment in compiled._find_referenced_environments():  # of the functions that were linked in
+            compiled.library.codegen.set_env(environment.env_name, environment)
+        add(compiled)
+
+    dispatcher.get_call_template = lambda args, kws: callee().get_call_template(args, kws)
+    dispatcher.get_overload = lambda signature: callee().get_overload(signature)
+    dispatcher.add_overload = add_with_environments
+
+
+def _callee(function: Callable[..., Any], options: dict[str, Any]) -> Any:
+    """A function for calls from compiled code.
+
+    Numba would compile it again for each constant passed to it, and for the first value of a loop's variable; here, constants
+    count as any other value.
     """
     callee = cast("Any", numba.njit)(**options, no_cpython_wrapper=True)(function)
 
@@ -58,22 +80,14 @@ def link_callees(dispatcher: Any, function: Callable[..., Any], options: dict[st
         flags.no_compile = True
         return flags
 
-    def add_callee(compiled: Any) -> None:
+    def add(compiled: Any) -> None:
         key = object()  # numba finds a function's code by its address, which this one does not have
         callee.targetctx.insert_user_function(key, compiled.fndesc, [_Unoptimised(compiled.library)])
         callee.overloads[tuple(compiled.signature.args)] = compiled._replace(entry_point=key)
 
-    resolve, plain, add = callee.get_call_template, cast("Any", types.unliteral), dispatcher.add_overload
-
-    def call_template(args: Any, kws: Any) -> Any:
-        return resolve([plain(kind) for kind in args], {name: plain(kind) for name, kind in kws.items()})
-
-    def add_with_environments(compiled: Any) -> None:
-        for environment in compiled._find_referenced_environments():  # of the functions that were linked in
-            compiled.library.codegen.set_env(environment.env_name, environment)
-        add(compiled)
-
-    callee._compiler._customize_flags, callee.add_overload = without_machine_code, add_callee
-    dispatcher.get_call_template, dispatcher.get_overload = call_template, callee.get_overload
-    dispatcher.add_overload = add_with_environments
-    dispatcher._compiling_counter = callee._compiling_counter  # by which numba notices recursion
+    resolve, plain = callee.get_call_template, cast("Any", types.unliteral)
+    callee.get_call_template = lambda args, kws: resolve(
+        [plain(kind) for kind in args], {name: plain(kind) for name, kind in kws.items()}
+    )
+    callee._compiler._customize_flags, callee.add_overload = without_machine_code, add
+    return callee

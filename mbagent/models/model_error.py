@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import isotonic_regression
+import scipy
 
 from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.models.protocol import TransitionModel
@@ -167,5 +167,5 @@ def _calibrated(doubts: Floats, wrong: Bools) -> tuple[Floats, Floats]:
     levels, place = np.unique(x[order], return_inverse=True)
     total = np.bincount(place, weights=weights[order])
     mean = np.bincount(place, weights=(weights * y)[order]) / total
-    rates, step = np.unique(isotonic_regression(mean, weights=total).x, return_inverse=True)
+    rates, step = np.unique(scipy.optimize.isotonic_regression(mean, weights=total).x, return_inverse=True)
     return np.bincount(step, weights=total * levels) / np.bincount(step, weights=total), rates

@@ -9,7 +9,7 @@ mistaken for a change.
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import gammaln
+import scipy
 
 from mbagent.data import TransitionBatch
 from mbagent.types import Bools, Floats, Ints
@@ -88,8 +88,8 @@ def still_hold(cells: Ints, values: Ints, since: int) -> Bools:
 
 def _evidence(counts: Ints, n_kinds: Ints) -> Floats:
     """Log marginal likelihood [G] of rewards with counts [G, K], ``n_kinds`` [G] distinct ones in each group."""
-    prior, total = COUNT * n_kinds, counts.sum(axis=1)
-    result: Floats = (gammaln(counts + COUNT) - gammaln(COUNT)).sum(axis=1) - gammaln(total + prior) + gammaln(prior)
+    prior, total, log_gamma = COUNT * n_kinds, counts.sum(axis=1), scipy.special.gammaln
+    result: Floats = (log_gamma(counts + COUNT) - log_gamma(COUNT)).sum(axis=1) - log_gamma(total + prior) + log_gamma(prior)
     return result
 
 

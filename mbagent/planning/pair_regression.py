@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csr_array
+import scipy
 
 from mbagent.planning.value_iteration import LeafValues, sum_of
 from mbagent.types import Floats, Ints, States
@@ -48,7 +47,7 @@ class PairRegression:
         used, column = np.unique(self._first[factors] + states[rows, factors], return_inverse=True)
         self._column = np.full(int(counts.sum()), -1)
         self._column[used] = np.arange(len(used))
-        self._x = csr_array((np.ones(len(rows)), (rows, column)), shape=(len(states), len(used)))
+        self._x = scipy.sparse.csr_array((np.ones(len(rows)), (rows, column)), shape=(len(states), len(used)))
         self._on, self._begin = self._active_features(valued)
         n_on = np.diff(self._begin)
         self._paired = len(used) <= MOST_PAIR_FEATURES and int((n_on * (n_on - 1) // 2).sum()) <= MOST_PAIRS
@@ -56,7 +55,7 @@ class PairRegression:
         kernel = shared + (PAIRED / 2.0) * shared * (shared - 1.0) if self._paired else shared
         self._kernel_mean = kernel.mean(axis=0)
         centred = kernel - self._kernel_mean - self._kernel_mean[:, None] + self._kernel_mean.mean()
-        self._factor, self._bounds = cho_factor(centred + RIDGE * np.eye(len(states))), (low, high)
+        self._factor, self._bounds = scipy.linalg.cho_factor(centred + RIDGE * np.eye(len(states))), (low, high)
 
     def _active_features(self, states: States) -> tuple[Ints, Ints]:
         """Active features of states [M, F], concatenated, and offsets where each state's features begin, int64 [M + 1]."""
@@ -68,7 +67,7 @@ class PairRegression:
     def fit(self, values: Floats) -> LeafValues:
         """Value function fitted to the states' values [N]."""
         mean, x = float(values.mean()), self._x
-        dual = cho_solve(self._factor, values - mean)
+        dual = scipy.linalg.cho_solve(self._factor, values - mean)
         pairs = PAIRED * (x.T @ x.multiply(dual[:, None])).toarray() if self._paired else np.zeros((0, 0))
         level = mean - float(dual @ self._kernel_mean)
         return LeafValues(self._common, self._first, self._column, level, x.T @ dual, np.ascontiguousarray(pairs), *self._bounds)

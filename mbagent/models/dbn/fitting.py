@@ -13,8 +13,8 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import gammainc, ndtr
 
 from mbagent.data import Factors, TransitionBatch
 from mbagent.models.dbn import sampling
@@ -146,7 +146,8 @@ def _correlated(error: Floats, other: Floats, spread: Floats, other_spread: Floa
     if few.any():
         both = _unexpected(error).T @ _unexpected(other)
         expected = _minority(spread).T @ _minority(other_spread)
-        result |= few & (both > 0.0) & (gammainc(np.maximum(both, 1.0), expected) < ndtr(-limit))  # P(Poisson >= both)
+        as_many = scipy.special.gammainc(np.maximum(both, 1.0), expected)  # P(Poisson >= both)
+        result |= few & (both > 0.0) & (as_many < scipy.special.ndtr(-limit))
     return result
 
 

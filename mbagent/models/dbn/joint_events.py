@@ -15,8 +15,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammaln
 
 from mbagent.data import Factors, TransitionBatch
 from mbagent.models.dbn import sampling
@@ -312,7 +312,7 @@ class _Search:
 
     def _penalty(self, size: int) -> float:
         """Logarithm of the number of patterns of a size."""
-        return float(size * np.log(len(self.items.kind)) - gammaln(size + 1.0))
+        return float(size * np.log(len(self.items.kind)) - scipy.special.gammaln(size + 1.0))
 
     def _pattern(self, items: Items) -> Pattern:
         """Pattern of ``items``, with observed and expected numbers of rows with all items."""

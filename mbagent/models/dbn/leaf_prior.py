@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
+import scipy
 
 from mbagent.models.dbn.score import Search
 from mbagent.types import Floats, Ints
@@ -17,7 +18,7 @@ CERTAIN_RATE = 0.02
 WIDTH = 0.25
 """Logits from one component of a mixture to the next, and each one's standard deviation."""
 
-CENTRES: Floats = special.expit(np.arange(-9.5, 9.5 + WIDTH, WIDTH))
+CENTRES: Floats = np.array([1.0 / (1.0 + math.exp(-logit)) for logit in np.arange(-9.5, 9.5 + WIDTH, WIDTH)])
 """Mean rates of the components, which are Beta distributions."""
 
 UP, DOWN = 1.0 / WIDTH**2 / (1.0 - CENTRES), 1.0 / WIDTH**2 / CENTRES
@@ -67,7 +68,7 @@ class LeafPrior:
     def _slab(self, n: Ints, e: Ints, prior_mean: Floats) -> tuple[Floats, Floats]:
         """Log-probability of the rows, and posterior mean rate, both under the slab."""
         up, down = self.strength * prior_mean, self.strength * (1.0 - prior_mean)
-        return special.betaln(up + e, down + n - e) - special.betaln(up, down), (e + up) / (n + self.strength)
+        return scipy.special.betaln(up + e, down + n - e) - scipy.special.betaln(up, down), (e + up) / (n + self.strength)
 
 
 @dataclass(frozen=True)
@@ -84,9 +85,9 @@ class MixedPrior(LeafPrior):
     weights: Floats
 
     def _slab(self, n: Ints, e: Ints, prior_mean: Floats) -> tuple[Floats, Floats]:
-        before = special.logsumexp(_likelihoods(0 * n, 0 * e, prior_mean, self.strength), axis=1, b=self.weights)
+        before = scipy.special.logsumexp(_likelihoods(0 * n, 0 * e, prior_mean, self.strength), axis=1, b=self.weights)
         after = _likelihoods(n, e, prior_mean, self.strength) + np.log(self.weights)
-        total = special.logsumexp(after, axis=1)
+        total = scipy.special.logsumexp(after, axis=1)
         counted = (n + self.strength)[:, None]
         means = (UP + e[:, None] + self.strength * prior_mean[:, None]) / (UP + DOWN + counted)
         return total - before, (np.exp(after - total[:, None]) * means).sum(axis=1)
@@ -134,7 +135,7 @@ def _with_spike(slab: Floats, certain: float, n: Ints, e: Ints, prior_mean: Floa
 def _likelihoods(n: Ints, e: Ints, prior_mean: Floats, strength: float) -> Floats:
     """Log-probability [N, K] of each leaf's rows, plus the pseudo-counts of the prior mean, under each component."""
     up, down = e + strength * prior_mean, n - e + strength * (1.0 - prior_mean)
-    result: Floats = special.betaln(UP + up[:, None], DOWN + down[:, None]) - special.betaln(UP, DOWN)
+    result: Floats = scipy.special.betaln(UP + up[:, None], DOWN + down[:, None]) - scipy.special.betaln(UP, DOWN)
     return result
 
 

@@ -21,10 +21,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -144,7 +143,7 @@ def dependent_groups(found: Influence) -> list[VariableGroup]:
 
 def _modules(found: Influence, links: NDArray[np.bool_]) -> list[VariableGroup]:
     """Connected components with several variables, or with one that depends on itself."""
-    _, label = connected_components(csr_matrix(links.astype(np.int64)), directed=False)
+    _, label = scipy.sparse.csgraph.connected_components(scipy.sparse.csr_matrix(links.astype(np.int64)), directed=False)
     result = []
     for component in range(label.max() + 1):
         members = np.flatnonzero(label == component)
