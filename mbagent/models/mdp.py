@@ -60,12 +60,20 @@ class GraphArrays(Struct):
 
 
 @compiled
+def tag_of(state: Ints, group: int, weights: Keys) -> np.uint64:
+    """Hash of a state [F] and a group: two sums of values times half of a weight, since these products are vectorised."""
+    half, low, high = np.uint64(0xFFFFFFFF), np.uint64(0), np.uint64(0)
+    for f in range(len(state)):
+        value = np.uint64(state[f] + 1) & half
+        low += value * (weights[f] & half)
+        high += value * (weights[f] >> np.uint64(32))
+    return mix(mix(low) ^ high ^ mix(np.uint64(group) + np.uint64(1)))
+
+
+@compiled
 def add_node(graph: GraphArrays, state: Ints, group: int) -> int:
     """The node of a state [F] in a group, added if it does not exist. The arrays must have spare capacity."""
-    total = np.uint64(0)
-    for f in range(len(state)):
-        total += np.uint64(state[f] + 1) * graph.weights[f]
-    tag, slots, sizes = mix(total ^ mix(np.uint64(group))), graph.slots, graph.sizes
+    tag, slots, sizes = tag_of(state, group, graph.weights), graph.slots, graph.sizes
     place = np.int64(tag & np.uint64(len(slots) - 1))
     while slots[place] >= 0:
         if graph.tags[slots[place]] == tag:
@@ -165,10 +173,7 @@ def _add_all(graph: GraphArrays, states: States, groups: Ints, nodes: Ints) -> N
 def _find_all(graph: GraphArrays, states: States, group: int, nodes: Ints) -> None:
     slots = graph.slots
     for b in range(len(states)):
-        total = np.uint64(0)
-        for f in range(states.shape[1]):
-            total += np.uint64(states[b, f] + 1) * graph.weights[f]
-        tag = mix(total ^ mix(np.uint64(group)))
+        tag = tag_of(states[b], group, graph.weights)
         place = np.int64(tag & np.uint64(len(slots) - 1))
         nodes[b] = -1
         while slots[place] >= 0:
