@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ from mbagent.models.reward_changes import still_hold, triples, turn
 from mbagent.spaces import PlaneLayout
 from mbagent.types import Actions, Bools, Floats, Ints, States
 from mbagent_envs.jit import compiled
+from mbagent_envs.structs import Struct
 
 HIDDEN = 64
 """Hidden nodes."""
@@ -49,7 +50,7 @@ class DenseReward(Module):
         return result
 
 
-class RewardWeights(NamedTuple):
+class RewardWeights(Struct):
     """The weights of a ``DenseReward`` for compiled code.
 
     Attributes:

@@ -25,11 +25,11 @@ LANES = 16
 """Hidden layers are padded with zeros to a multiple of this, for vector instructions."""
 
 
-def compiled_body(predictor: nn.Module, layout: Layout) -> CompiledBody:
+def compiled_body(predictor: nn.Module) -> CompiledBody:
     """Inference function for a predictor's current weights: compiled if the predictor has a kernel, else by torch."""
     if isinstance(predictor, DensePredictor):
         dense = pack_dense(predictor)
-        return lambda states, actions: dense_logits(states, actions, layout, dense)
+        return lambda states, actions: dense_logits(states, actions, dense)
     return lambda states, actions: in_chunks(predictor, states, actions)
 
 
@@ -44,7 +44,7 @@ def in_chunks(predictor: nn.Module, states: States, actions: Actions) -> Floats3
         chunk_actions = np.zeros(ROWS_PER_CHUNK, dtype=np.int64)
         chunk_states[:n], chunk_actions[:n] = states[rows], actions[rows]
         parts.append(predictor(torch.from_numpy(chunk_states), torch.from_numpy(chunk_actions)).numpy()[:n])
-    return np.concatenate(parts).astype(np.float32, copy=False)
+    return np.ascontiguousarray(np.concatenate(parts), dtype=np.float32)
 
 
 def pack_layout(codec: FactorCodec) -> Layout:
@@ -77,6 +77,7 @@ def pack_dense(predictor: DensePredictor) -> DenseWeights:
     if predictor.stay is not None:
         stay += _array(predictor.stay)
     return DenseWeights(
+        pack_layout(codec),
         first,
         inner,
         bias,
@@ -114,6 +115,7 @@ def pack_groups(conditioner: Conditioner) -> GroupWeights:
         table[bits, 1] -= table[bits, 0]
         table[bits, 0] = 0.0
     return GroupWeights(
+        pack_layout(codec),
         index,
         np.ascontiguousarray(np.concatenate([columns, both], axis=1)),
         np.ascontiguousarray(_array(conditioner.groups.bias).reshape(n_groups, size)),

@@ -5,27 +5,28 @@ Each block of rows is initialised with samples from the predictor and with the s
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from mbagent.models.neural.kernels import (
+    FactorWork,
     Floats32,
     GroupWeights,
-    Layout,
+    Rows,
     active_columns,
     add_columns,
     add_scaled,
     copy_row,
     count_below,
+    factor_work,
     finish,
     trusted,
 )
 from mbagent.models.neural.sampling import draw_at
 from mbagent.models.systematic_sampling import draw, largest
 from mbagent.types import Floats, Ints, Keys
-from mbagent_envs.jit import borrowed, compiled, inlined, vectorised
+from mbagent_envs.jit import compiled, inlined, vectorised
 from mbagent_envs.random_keys import derive_one, fill_row
+from mbagent_envs.structs import Struct
 
 LEEWAY = 2.0
 """Assumed largest factor by which the conditioner raises the odds of an unlikely value of a trusted factor."""
@@ -40,7 +41,7 @@ ALWAYS = 2.0
 """A bound above all random numbers: as ``low`` it marks an open factor."""
 
 
-class Block(NamedTuple):
+class Block(Struct):
     """Data of R rows; the next factors have C columns.
 
     Attributes:
@@ -65,7 +66,7 @@ class Block(NamedTuple):
     sums: Floats32
 
 
-class SweepWork(NamedTuple):
+class SweepWork(Struct):
     """Work space for one row.
 
     Attributes:
@@ -79,9 +80,7 @@ class SweepWork(NamedTuple):
         rank: second random number of each factor, which determines the order of resampling, [O].
         ranks: ``rank`` of each chosen factor, [O].
         order: the chosen factors in order of resampling, int64 [O].
-        hidden: values of one group's hidden nodes, [1, G].
-        row_logits: logits of one factor, [K].
-        given: distribution of that factor, [K].
+        factor: of one factor.
     """
 
     active: Ints
@@ -93,16 +92,37 @@ class SweepWork(NamedTuple):
     rank: Floats
     ranks: Floats
     order: Ints
-    hidden: Floats32
-    row_logits: Floats32
-    given: Floats
+    factor: FactorWork
 
 
-@compiled
-def work_space(n_rows: int, layout: Layout, group: GroupWeights) -> tuple[Block, SweepWork]:
-    """Work space for a block of up to ``n_rows`` rows, and for one row; ``layout`` and ``group`` give the shapes."""
-    n_outputs, size, n_values = len(layout.outputs), group.bias.shape[1], group.offset.shape[1]
-    n_columns, n_active, rows = group.both_start - group.next_start, n_outputs + layout.n_steps, min(n_rows, GIBBS_ROWS)
+class Sweeps(Struct):
+    """A batch to sample, the parameters, and the work space.
+
+    Attributes:
+        rows: the batch.
+        keys: uint64 [B].
+        group: the conditioner, masked "others".
+        certain, sweeps, real_guess: see ``sample_sweeps``.
+        block: data of the rows that are sampled at once.
+        work: for one row.
+        factors: the samples, int64 [B, O].
+    """
+
+    rows: Rows
+    keys: Keys
+    group: GroupWeights
+    certain: float
+    sweeps: int
+    real_guess: bool
+    block: Block
+    work: SweepWork
+    factors: Ints
+
+
+def work_space(n_rows: int, group: GroupWeights) -> tuple[Block, SweepWork]:
+    """Work space for a block of up to ``n_rows`` rows, and for one row."""
+    n_outputs, size = len(group.group_of), group.bias.shape[1]
+    n_columns, n_active, rows = group.both_start - group.next_start, n_outputs + group.layout.n_steps, min(n_rows, GIBBS_ROWS)
     n_slots = 1 + max(n_outputs, min(rows * n_outputs, MOST_SUMS // size))
     block = Block(
         np.empty((rows, n_columns), dtype=np.float32),
@@ -124,53 +144,35 @@ def work_space(n_rows: int, layout: Layout, group: GroupWeights) -> tuple[Block,
         np.empty(n_outputs, dtype=np.float64),
         np.empty(n_outputs, dtype=np.float64),
         np.empty(n_outputs, dtype=np.int64),
-        np.empty((1, size), dtype=np.float32),
-        np.empty(n_values, dtype=np.float32),
-        np.empty(n_values, dtype=np.float64),
+        factor_work(group),
     )
     return block, work
 
 
 @compiled
-def begin_block(
-    first: int,
-    states: Ints,
-    actions: Ints,
-    probs: Floats,
-    keys: Keys,
-    layout: Layout,
-    group: GroupWeights,
-    certain: float,
-    real_guess: bool,
-    block: Block,
-    work: SweepWork,
-    factors: Ints,
-) -> int:
+def _begin_block(first: int, s: Sweeps) -> int:
     """Initialises rows from ``first`` on while the block can hold them and their open factors' sums; returns how many."""
-    # The caller keeps all arrays alive, so that reference counting for every factor can be avoided.
-    states, probs, factors = borrowed(states), borrowed(probs), borrowed(factors)
-    layout, group, k, w = borrowed(layout), borrowed(group), borrowed(block), borrowed(work)
-    n_slots = 0
-    for r in range(min(len(states) - first, len(k.low))):
+    probs, k, w, factors, group_of, n_slots = s.rows.probs, s.block, s.work, s.factors, s.group.group_of, 0
+    for r in range(min(len(probs) - first, len(k.low))):
         b, n_open = first + r, 0
-        fill_row(keys[b], w.noise)
+        fill_row(s.keys[b], w.noise)
         if probs.shape[2] == 2:
             _draw_bits(probs, b, w.noise, factors)
-            _bound_bits(probs, b, r, group.group_of, certain, k.low, k.high)
-            _likeliest_bits(probs, b, r, group.group_of, factors, k.top)
-            _show_bits(probs, b, r, factors, k.low, real_guess, k.guess)
+            _bound_bits(probs, b, r, group_of, s.certain, k.low, k.high)
+            _likeliest_bits(probs, b, r, group_of, factors, k.top)
+            _show_bits(probs, b, r, factors, k.low, s.real_guess != 0, k.guess)
         else:
-            for i in range(len(layout.outputs)):
-                _begin_factor(b, r, i, probs, layout, group, certain, real_guess, k, w, factors)
-        for i in range(len(layout.outputs)):
+            for i in range(len(group_of)):
+                _begin_factor(b, r, i, s)
+        for i in range(len(group_of)):
             is_open = k.low[r, i] == ALWAYS
             k.slot[r, i] = n_slots + n_open if is_open else -1
             n_open += int(is_open)
         if n_slots + n_open >= len(k.sums):
             return r  # this row is initialised again in the next block
         n_slots += n_open
-        k.n_columns[r] = list_columns(b, r, states, actions[b], layout, k, w, k.columns[r])
-    return min(len(states) - first, len(k.low))
+        k.n_columns[r] = _list_columns(b, r, s, k.columns[r])
+    return min(len(probs) - first, len(k.low))
 
 
 @vectorised
@@ -209,39 +211,30 @@ def _show_bits(probs: Floats, b: int, r: int, factors: Ints, low: Floats, real_g
 
 
 @inlined
-def _begin_factor(
-    b: int,
-    r: int,
-    i: int,
-    probs: Floats,
-    layout: Layout,
-    group: GroupWeights,
-    certain: float,
-    real_guess: bool,
-    k: Block,
-    w: SweepWork,
-    factors: Ints,
-) -> None:
+def _begin_factor(b: int, r: int, i: int, s: Sweeps) -> None:
     """Draws factor i's initial value; sets bounds: only random numbers outside them require the conditioner's output."""
-    n, start, top = layout.outputs[i], layout.start[i], largest(probs, b, i, layout.outputs[i])
-    value = draw_at(probs, b, i, n, w.noise[i])
-    trust = trusted(probs, b, i, layout, group, certain)
+    probs, k, n, start = s.rows.probs, s.block, s.group.layout.outputs[i], s.group.layout.start[i]
+    top = largest(probs, b, i, n)
+    value = draw_at(probs, b, i, n, s.work.noise[i])
+    trust = trusted(s.rows, b, i, s.group, s.certain)
     below = 0.0
     for v in range(top):
         below += probs[b, i, v]
     above = max(1.0 - probs[b, i, top] - below, 0.0)
-    factors[b, i], k.top[r, i] = value, top
+    s.factors[b, i], k.top[r, i] = value, top
     k.low[r, i], k.high[r, i] = (LEEWAY * below, 1.0 - LEEWAY * above) if trust else (ALWAYS, ALWAYS)
-    if group.group_of[i] < 0:
+    if s.group.group_of[i] < 0:
         k.top[r, i], k.low[r, i], k.high[r, i] = value, 0.0, ALWAYS
-    for v in range(n):
-        k.guess[r, start + v] = probs[b, i, v] if real_guess and not trust else float(int(value == v))
+    for v in range(1 if n == 2 else 0, n):  # a bit has one column
+        column = start + (0 if n == 2 else v)
+        k.guess[r, column] = probs[b, i, v] if s.real_guess and not trust else float(int(value == v))
 
 
 @inlined
-def list_columns(b: int, r: int, states: Ints, action: int, layout: Layout, k: Block, w: SweepWork, columns: Ints) -> int:
+def _list_columns(b: int, r: int, s: Sweeps, columns: Ints) -> int:
     """Writes to ``columns`` the indices of row b's columns that are 1; returns the count. No unpredictable branches."""
-    n_active, n = active_columns(states, b, action, layout, w.active), 0
+    k, w, layout = s.block, s.work, s.group.layout
+    n_active, n = active_columns(s.rows.states, b, s.rows.actions[b], layout, w.active), 0
     w.on[:] = 0
     for a in range(n_active - layout.n_steps):
         w.on[w.active[a]] = 1
@@ -256,22 +249,19 @@ def list_columns(b: int, r: int, states: Ints, action: int, layout: Layout, k: B
 
 
 @inlined
-def sum_columns(
-    i: int, r: int, columns: Ints, n_columns: int, group: GroupWeights, real_guess: bool, k: Block, slot: int
-) -> None:
-    """Writes the summed input of factor i's group to ``k.sums[slot]``.
+def _sum_columns(i: int, r: int, columns: Ints, n_columns: int, real_guess: bool, s: Sweeps, slot: int) -> None:
+    """Writes the summed input of factor i's group to row ``slot`` of the block's ``sums``.
 
     Args:
         i: the factor.
         r: row of the block.
         columns: the columns that are 1.
         n_columns: number of these columns.
-        group: the conditioner.
         real_guess: whether columns of the next factors may lie between 0 and 1.
-        k: the block.
-        slot: row of ``k.sums``.
+        s: the batch.
+        slot: see above.
     """
-    g = group.group_of[i]
+    k, group, g = s.block, s.group, s.group.group_of[i]
     copy_row(group.bias, g, k.sums, slot)
     add_columns(group.columns, g, columns, n_columns, k.sums, slot)
     if real_guess:
@@ -281,13 +271,13 @@ def sum_columns(
 
 
 @compiled
-def sum_up(n_rows: int, layout: Layout, group: GroupWeights, real_guess: bool, block: Block) -> None:
+def _sum_up(n_rows: int, s: Sweeps) -> None:
     """Sums open factors' inputs at the initial values, one group at a time for all rows, so that weights stay cached."""
-    layout, group, k = borrowed(layout), borrowed(group), borrowed(block)
-    for i in range(len(layout.outputs)):
+    k = s.block
+    for i in range(len(s.group.group_of)):
         for r in range(n_rows):
             if k.slot[r, i] >= 0:
-                sum_columns(i, r, k.columns[r], k.n_columns[r], group, real_guess, k, k.slot[r, i])
+                _sum_columns(i, r, k.columns[r], k.n_columns[r], s.real_guess != 0, s, k.slot[r, i])
 
 
 _ORDER = np.uint64(1 << 32)
@@ -310,28 +300,12 @@ def _shuffle(n: int, key: np.uint64, w: SweepWork) -> None:
         w.order[place] = w.chosen[step]
 
 
-@compiled
-def sample_sweeps(
-    states: Ints,
-    actions: Ints,
-    logits: Floats32,
-    probs: Floats,
-    keys: Keys,
-    layout: Layout,
-    group: GroupWeights,
-    certain: float,
-    sweeps: int,
-    real_guess: bool,
-) -> Ints:
+def sample_sweeps(rows: Rows, keys: Keys, group: GroupWeights, certain: float, sweeps: int, real_guess: bool) -> Ints:
     """The paper's method: samples from the predictor, then resamples every factor given the others, ``sweeps`` times.
 
     Args:
-        states: int64 [B, F].
-        actions: int64 [B].
-        logits: the predictor's logits, float32 [B, O, K].
-        probs: the predictor's probabilities, float64 [B, O, K].
+        rows: the batch.
         keys: uint64 [B].
-        layout: the factors.
         group: the conditioner, masked "others".
         certain: a factor is trusted if the predictor gives its most likely value at least this probability. In every sweep it
             takes that value, and the conditioner is not evaluated, unless the factor's random number is so extreme that raising
@@ -344,40 +318,28 @@ def sample_sweeps(
     Returns:
         Samples int64 [B, O].
     """
-    factors = np.empty((len(states), len(layout.outputs)), dtype=np.int64)
-    block, work = work_space(len(states), layout, group)
-    first = 0
-    while first < len(states):
-        n_rows = begin_block(first, states, actions, probs, keys, layout, group, certain, real_guess, block, work, factors)
-        sum_up(n_rows, layout, group, real_guess, block)
-        for r in range(n_rows):
-            b = first + r
-            _sweep_row(b, r, states, actions[b], logits, keys[b], layout, group, sweeps, real_guess, block, work, factors)
-        first += n_rows
+    factors = np.empty(rows.probs.shape[:2], dtype=np.int64)
+    _sample(Sweeps(rows, keys, group, certain, sweeps, real_guess, *work_space(len(factors), group), factors))
     return factors
 
 
 @compiled
-def _sweep_row(
-    b: int,
-    r: int,
-    states: Ints,
-    action: int,
-    logits: Floats32,
-    row_key: np.uint64,
-    layout: Layout,
-    group: GroupWeights,
-    sweeps: int,
-    real_guess: bool,
-    block: Block,
-    work: SweepWork,
-    factors: Ints,
-) -> None:
-    """Performs the sweeps of row b, which is row r of its block; updates ``factors`` [B, O] in place."""
-    states, logits, factors = borrowed(states), borrowed(logits), borrowed(factors)
-    layout, group, k, w = borrowed(layout), borrowed(group), borrowed(block), borrowed(work)
-    for sweep in range(sweeps):
-        key, anew = derive_one(row_key, np.uint64(sweep)), real_guess and sweep == 0
+def _sample(s: Sweeps) -> None:
+    first = 0
+    while first < len(s.factors):
+        n_rows = _begin_block(first, s)
+        _sum_up(n_rows, s)
+        for r in range(n_rows):
+            _sweep_row(first + r, r, s)
+        first += n_rows
+
+
+@compiled
+def _sweep_row(b: int, r: int, s: Sweeps) -> None:
+    """Performs the sweeps of row b, which is row r of its block; updates its samples in place."""
+    k, w, factors = s.block, s.work, s.factors
+    for sweep in range(s.sweeps):
+        key, anew = derive_one(s.keys[b], np.uint64(sweep)), s.real_guess != 0 and sweep == 0
         fill_row(key, w.noise)
         n = _choose(b, r, k, w, factors)
         _shuffle(n, derive_one(key, _ORDER), w)
@@ -387,13 +349,13 @@ def _sweep_row(
             if u < k.low[r, i] or u >= k.high[r, i]:
                 if slot < 0:
                     slot = len(k.sums) - 1
-                    n_columns = list_columns(b, r, states, action, layout, k, w, w.columns)
-                    sum_columns(i, r, w.columns, n_columns, group, anew, k, slot)
-                finish(b, i, logits, layout, group, k.sums, slot, w.hidden, w.row_logits, w.given)
-                value = draw(w.given, layout.outputs[i], u)
+                    n_columns = _list_columns(b, r, s, w.columns)
+                    _sum_columns(i, r, w.columns, n_columns, anew, s, slot)
+                finish(b, i, s.rows, s.group, k.sums, slot, w.factor)
+                value = draw(w.factor.given, s.group.layout.outputs[i], u)
             if value != factors[b, i] or anew:
                 factors[b, i] = value
-                _change(r, i, value, step + 1 if sweep == sweeps - 1 else 0, n, layout, group, k, w)
+                _change(r, i, value, step + 1 if sweep == s.sweeps - 1 else 0, n, s)
 
 
 @inlined
@@ -407,18 +369,16 @@ def _choose(b: int, r: int, k: Block, w: SweepWork, factors: Ints) -> int:
 
 
 @inlined
-def _change(
-    r: int, i: int, value: int, begin: int, end: int, layout: Layout, group: GroupWeights, k: Block, w: SweepWork
-) -> None:
-    """Writes factor i's value to its columns; updates the sums of the open factors among ``w.order[begin:end]``."""
-    n = layout.outputs[i]
+def _change(r: int, i: int, value: int, begin: int, end: int, s: Sweeps) -> None:
+    """Writes factor i's value to its columns; updates the sums of the open factors among ``order[begin:end]``."""
+    k, order, group, n, start = s.block, s.work.order, s.group, s.group.layout.outputs[i], s.group.layout.start[i]
     for v in range(1 if n == 2 else 0, n):
-        column = layout.start[i] + (0 if n == 2 else v)
+        column = start + (0 if n == 2 else v)
         difference = np.float32(int(value == v)) - k.guess[r, column]
         k.guess[r, column] = float(int(value == v))
         if difference != 0.0:
             for step in range(begin, end):
-                slot = k.slot[r, w.order[step]]
+                slot = k.slot[r, order[step]]
                 if slot >= 0:
-                    g = group.group_of[w.order[step]]
+                    g = group.group_of[order[step]]
                     add_scaled(group.columns, g, group.next_start + column, difference, k.sums, slot)

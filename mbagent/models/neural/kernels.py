@@ -9,7 +9,6 @@ Shapes: B batch, F state factors, O = F + 1 output factors, K largest cardinalit
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from mbagent.models.systematic_sampling import largest
 from mbagent.types import Floats, Ints
 from mbagent_envs.jit import compiled, inlined, vectorised
+from mbagent_envs.structs import Struct
 
 Floats32 = NDArray[np.float32]
 
@@ -256,7 +256,7 @@ KERNEL_ROWS = 32
 """Rows of a batch to which each layer of a predictor is applied while its weights are cached."""
 
 
-class Layout(NamedTuple):
+class Layout(Struct):
     """Layout of factors among columns.
 
     Attributes:
@@ -274,10 +274,11 @@ class Layout(NamedTuple):
     n_steps: int
 
 
-class DenseWeights(NamedTuple):
+class DenseWeights(Struct):
     """A ``DensePredictor``'s arrays: L hidden layers of padded size <= H; C output columns, padded to a multiple of 4.
 
     Attributes:
+        layout: the factors.
         first: weights from the (state, action) columns, [n_inputs, H]; if L = 0, [n_inputs, C].
         inner: weights between successive hidden layers, [max(L - 1, 0), H, H]; axis 1: nodes of the later layer.
         bias: biases of the hidden layers, [L, H].
@@ -289,6 +290,7 @@ class DenseWeights(NamedTuple):
         activation: one of the codes in ACTIVATION_CODES.
     """
 
+    layout: Layout
     first: Floats32
     inner: Floats32
     bias: Floats32
@@ -310,10 +312,11 @@ class DenseWeights(NamedTuple):
         return self.column_bias[: self.n_columns]
 
 
-class GroupWeights(NamedTuple):
+class GroupWeights(Struct):
     """A ``Conditioner`` with g groups.
 
     Attributes:
+        layout: the factors.
         group_of: group of each output factor, -1 if it has none, int64 [O].
         columns: weights from all columns, [g, n_inputs + n_columns + n_state_columns, G]: first those from state and action,
             then those from the next factors (zero where masked or pruned), then the sum of each state column's two weights, used
@@ -328,6 +331,7 @@ class GroupWeights(NamedTuple):
         correction: whether the predictor's logits are added.
     """
 
+    layout: Layout
     group_of: Ints
     columns: Floats32
     bias: Floats32
@@ -354,6 +358,22 @@ class GroupWeights(NamedTuple):
         return self.to_values.transpose(0, 2, 1)
 
 
+class Rows(Struct):
+    """A batch, with the predictor's results.
+
+    Attributes:
+        states: int64 [B, F].
+        actions: int64 [B].
+        logits: float32 [B, O, K].
+        probs: float64 [B, O, K].
+    """
+
+    states: Ints
+    actions: Ints
+    logits: Floats32
+    probs: Floats
+
+
 @inlined
 def active_columns(states: Ints, b: int, action: int, layout: Layout, out: Ints) -> int:
     """Writes to ``out`` [F + n_steps] indices of row b's input columns that are 1, actions last; returns the count."""
@@ -373,16 +393,14 @@ def active_columns(states: Ints, b: int, action: int, layout: Layout, out: Ints)
 
 
 @inlined
-def add_next(
-    states: Ints, b: int, i: int, value: int, layout: Layout, group: GroupWeights, columns: Ints, n: int, place: int
-) -> int:
+def add_next(states: Ints, b: int, i: int, value: int, group: GroupWeights, columns: Ints, n: int, place: int) -> int:
     """Adds factor i's next-value column to ``columns``, the list from ``active_columns``; returns its new length.
 
     ``place`` is the list index of the factor's state column that is 1, if any; if the value is unchanged, only this entry
     changes. Uses no branches, since they would be unpredictable.
     """
-    column, on = layout.start[i], 1
-    if layout.outputs[i] == 2:
+    column, on = group.layout.start[i], 1
+    if group.layout.outputs[i] == 2:
         on = value
     else:
         column += value
@@ -403,11 +421,9 @@ def next_place(states: Ints, b: int, i: int, layout: Layout, place: int) -> int:
 
 
 @inlined
-def _add_residual(
-    states: Ints, b: int, active: Ints, n_active: int, layout: Layout, stay: Floats32, columns: Floats32, r: int
-) -> None:
+def _add_residual(states: Ints, b: int, active: Ints, n_active: int, dense: DenseWeights, columns: Floats32, r: int) -> None:
     """Adds the residual path: for each state column, plus its weight if the column is 1, minus its weight if the column is 0."""
-    n_on = n_active - layout.n_steps
+    layout, stay, n_on = dense.layout, dense.stay, n_active - dense.layout.n_steps
     for step in range(n_on, n_active):
         row = active[step] - layout.n_state_columns
         if layout.n_state_columns == states.shape[1]:  # all are bits
@@ -419,32 +435,37 @@ def _add_residual(
             columns[r, active[a]] += np.float32(2.0) * stay[row, active[a]]
 
 
+class DenseWork(Struct):
+    """Work space for a block of R rows.
+
+    Attributes:
+        active: indices of one row's input columns that are 1, int64 [F + n_steps].
+        now: values of a hidden layer, [R, H].
+        after: values of the next layer, [R, H].
+        columns: output columns, [R, C].
+    """
+
+    active: Ints
+    now: Floats32
+    after: Floats32
+    columns: Floats32
+
+
 @inlined
-def _dense_block(
-    first: int,
-    n_rows: int,
-    states: Ints,
-    actions: Ints,
-    layout: Layout,
-    dense: DenseWeights,
-    active: Ints,
-    now: Floats32,
-    after: Floats32,
-    columns: Floats32,
-) -> None:
-    """Output ``columns`` [R, C] of ``n_rows`` rows from ``first``; scratch: ``active``; ``now``, ``after`` [R, H]."""
-    depth = len(dense.sizes)
+def _dense_block(first: int, n_rows: int, states: Ints, actions: Ints, dense: DenseWeights, work: DenseWork) -> None:
+    """Computes ``work.columns`` of ``n_rows`` rows from ``first``."""
+    depth, now, after, columns = len(dense.sizes), work.now, work.after, work.columns
     for r in range(n_rows):
         b = first + r
-        n_active = active_columns(states, b, actions[b], layout, active)
+        n_active = active_columns(states, b, actions[b], dense.layout, work.active)
         for column in range(columns.shape[1]):
             columns[r, column] = dense.column_bias[column]
-        _add_residual(states, b, active, n_active, layout, dense.stay, columns, r)
+        _add_residual(states, b, work.active, n_active, dense, columns, r)
         if depth == 0:
-            add_rows(dense.first, active, n_active, columns, r)
+            add_rows(dense.first, work.active, n_active, columns, r)
             continue
         copy_row(dense.bias, 0, now, r)
-        add_rows(dense.first, active, n_active, now, r)
+        add_rows(dense.first, work.active, n_active, now, r)
         activate(now, r, dense.sizes[0], dense.activation)
     for level in range(1, depth):
         for r in range(n_rows):
@@ -457,24 +478,32 @@ def _dense_block(
         add_products(now, n_rows, dense.sizes[depth - 1], dense.to_columns, columns)
 
 
-@compiled
-def dense_logits(states: Ints, actions: Ints, layout: Layout, dense: DenseWeights) -> Floats32:
+def dense_logits(states: Ints, actions: Ints, dense: DenseWeights) -> Floats32:
     """A dense predictor's logits, float32 [B, O, K]; -1e9 for values that a factor does not have."""
-    n_outputs, width = len(layout.outputs), layout.outputs.max()
-    logits = np.full((len(states), n_outputs, width), np.float32(-1e9), dtype=np.float32)
-    rows = min(len(states), KERNEL_ROWS)
-    active = np.empty(states.shape[1] + layout.n_steps, dtype=np.int64)
+    outputs, rows = dense.layout.outputs, min(len(states), KERNEL_ROWS)
+    logits = np.full((len(states), len(outputs), outputs.max()), np.float32(-1e9), dtype=np.float32)
     now = np.empty((rows, dense.to_columns.shape[1]), dtype=np.float32)
-    after = np.empty_like(now)
-    columns = np.empty((rows, len(dense.column_bias)), dtype=np.float32)
+    work = DenseWork(
+        np.empty(states.shape[1] + dense.layout.n_steps, dtype=np.int64),
+        now,
+        np.empty_like(now),
+        np.empty((rows, len(dense.column_bias)), dtype=np.float32),
+    )
+    _write_logits(states, actions, dense, work, logits)
+    return logits
+
+
+@compiled
+def _write_logits(states: Ints, actions: Ints, dense: DenseWeights, work: DenseWork, logits: Floats32) -> None:
+    layout, columns = dense.layout, work.columns
     for first in range(0, len(states), KERNEL_ROWS):
         n_rows = min(KERNEL_ROWS, len(states) - first)
-        _dense_block(first, n_rows, states, actions, layout, dense, active, now, after, columns)
+        _dense_block(first, n_rows, states, actions, dense, work)
         for r in range(n_rows):
-            if width == 2:
+            if logits.shape[2] == 2:
                 write_bits(columns, r, logits, first + r)
                 continue
-            for i in range(n_outputs):
+            for i in range(logits.shape[1]):
                 start = layout.start[i]
                 if layout.outputs[i] == 2:
                     logits[first + r, i, 0] = 0.0
@@ -482,45 +511,50 @@ def dense_logits(states: Ints, actions: Ints, layout: Layout, dense: DenseWeight
                 else:
                     for k in range(layout.outputs[i]):
                         logits[first + r, i, k] = columns[r, start + k]
-    return logits
 
 
 @inlined
-def trusted(probs: Floats, b: int, i: int, layout: Layout, group: GroupWeights, certain: float) -> bool:
-    """Whether to trust the predictor for row b's factor i: no group, or a value of ``probs`` [B, O, K] >= ``certain``."""
+def trusted(rows: Rows, b: int, i: int, group: GroupWeights, certain: float) -> bool:
+    """Whether to trust the predictor for row b's factor i: it has no group, or a value of probability at least ``certain``."""
     if group.group_of[i] < 0:
         return True
-    return bool(probs[b, i, largest(probs, b, i, layout.outputs[i])] >= certain)
+    return bool(rows.probs[b, i, largest(rows.probs, b, i, group.layout.outputs[i])] >= certain)
+
+
+class FactorWork(Struct):
+    """Work space for one factor.
+
+    Attributes:
+        hidden: values of its group's hidden nodes, [1, G].
+        logits: its logits, [K].
+        given: its distribution, [K].
+    """
+
+    hidden: Floats32
+    logits: Floats32
+    given: Floats
+
+
+def factor_work(group: GroupWeights) -> FactorWork:
+    """Work space for a factor of any group."""
+    _, n_values, size = group.to_values.shape
+    return FactorWork(np.empty((1, size), dtype=np.float32), np.empty(n_values, dtype=np.float32), np.empty(n_values))
 
 
 @inlined
-def finish(
-    b: int,
-    i: int,
-    logits: Floats32,
-    layout: Layout,
-    group: GroupWeights,
-    sums: Floats32,
-    row: int,
-    hidden: Floats32,
-    row_logits: Floats32,
-    out: Floats,
-) -> None:
-    """Computes factor i's distribution ``out`` [K] from the summed input ``sums[row]`` [G] of its group.
-
-    ``logits`` [B, O, K] are the predictor's; ``hidden`` [1, G] and ``row_logits`` [K] are work space.
-    """
-    n, g, code = layout.outputs[i], group.group_of[i], group.activation
+def finish(b: int, i: int, rows: Rows, group: GroupWeights, sums: Floats32, row: int, work: FactorWork) -> None:
+    """Computes the distribution ``work.given`` of row b's factor i from the summed input ``sums[row]`` [G] of its group."""
+    n, g, code, hidden, logits = group.layout.outputs[i], group.group_of[i], group.activation, work.hidden, work.logits
     if n > 2:  # each node's activation once, for all values
         for h in range(hidden.shape[1]):
             hidden[0, h] = sums[row, h]
         activate(hidden, 0, hidden.shape[1], code)
         for k in range(n):
-            row_logits[k] = group.offset[g, k] + product(hidden, 0, LINEAR, group.to_values, g, k)
+            logits[k] = group.offset[g, k] + product(hidden, 0, LINEAR, group.to_values, g, k)
     else:
-        row_logits[0] = 0.0
-        row_logits[1] = group.offset[g, 1] + product(sums, row, code, group.to_values, g, 1)
+        logits[0] = 0.0
+        logits[1] = group.offset[g, 1] + product(sums, row, code, group.to_values, g, 1)
     if group.correction:
         for k in range(n):
-            row_logits[k] += logits[b, i, k]
-    softmax(row_logits, n, out)
+            logits[k] += rows.logits[b, i, k]
+    softmax(logits, n, work.given)

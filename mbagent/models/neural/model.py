@@ -14,7 +14,7 @@ from mbagent.models.fit_report import FitReport
 from mbagent.models.neural.connections import PruningConfig, check_fraction
 from mbagent.models.neural.export import CompiledBody, as_rows, compiled_body, pack_groups
 from mbagent.models.neural.gibbs import sample_sweeps
-from mbagent.models.neural.kernels import Floats32, GroupWeights, probabilities
+from mbagent.models.neural.kernels import GroupWeights, Rows, probabilities
 from mbagent.models.neural.network_pair import NO_MARKS, NetworkPair
 from mbagent.models.neural.networks import DensePredictor
 from mbagent.models.neural.pruning import VariableGroup, dependent_groups, influence, modules, prune_networks
@@ -144,21 +144,11 @@ class NeuralTransitionModel(NetworkPair):
     def _exact_match(self, rows: Examples) -> float:
         """Weighted share of transitions whose outcome is the greedy prediction (each factor's most likely value in turn)."""
         states, actions, outcomes = rows.states.numpy(), rows.actions.numpy(), rows.outcomes.numpy()
-        logits, probs = self._predict(states, actions)
-        likeliest = probs.argmax(axis=2)
+        batch = self._rows(*as_rows(states, actions, len(self.cardinalities)))
+        likeliest = batch.probs.argmax(axis=2)
         if self.config.conditioner == "causal":
             keys = np.zeros(len(states), dtype=np.uint64)
-            likeliest = sample_causal(
-                states,
-                actions,
-                logits,
-                probs,
-                keys,
-                self._layout,
-                self._packed_groups(),
-                self.config.certain,
-                True,
-            )
+            likeliest = sample_causal(batch, keys, self._packed_groups(), self.config.certain, True)
         weights = rows.weights.numpy()
         return float(np.average((likeliest == outcomes).all(axis=1), weights=weights)) if len(weights) else 1.0
 
@@ -184,35 +174,13 @@ class NeuralTransitionModel(NetworkPair):
         states, actions = as_rows(states, actions, len(self.cardinalities))
         if (rules := self.rules()) is not None:
             return sample_rules(states, actions, keys, rules)
-        logits, probs = self._predict(states, actions)
-        config = self.config
+        rows, config = self._rows(states, actions), self.config
         if config.conditioner is None:
-            factors = sample_independent(probs, self._layout.outputs, keys)
+            factors = sample_independent(rows.probs, self._layout.outputs, keys)
         elif config.conditioner == "causal":
-            factors = sample_causal(
-                states,
-                actions,
-                logits,
-                probs,
-                keys,
-                self._layout,
-                self._packed_groups(),
-                config.certain,
-                False,
-            )
+            factors = sample_causal(rows, keys, self._packed_groups(), config.certain, False)
         else:
-            factors = sample_sweeps(
-                states,
-                actions,
-                logits,
-                probs,
-                keys,
-                self._layout,
-                self._packed_groups(),
-                config.certain,
-                config.sweeps,
-                config.real_guess,
-            )
+            factors = sample_sweeps(rows, keys, self._packed_groups(), config.certain, config.sweeps, config.real_guess)
         return np.ascontiguousarray(factors[:, :-1]), factors[:, -1] == 1
 
     def marginals(self, states: States, actions: Actions) -> Floats:
@@ -223,7 +191,7 @@ class NeuralTransitionModel(NetworkPair):
 
     def probabilities(self, states: States, actions: Actions) -> Floats:
         """The predictor's distribution of each factor, ``terminated`` last: float64 [B, O, K]; 0 beyond its cardinality."""
-        return self._predict(*as_rows(states, actions, len(self.cardinalities)))[1]
+        return self._rows(*as_rows(states, actions, len(self.cardinalities))).probs
 
     def log_prob(self, states: States, actions: Actions, next_states: States, terminated: Bools) -> Floats:
         """See TransitionModel; exact for the distribution that ``sample`` draws from."""
@@ -234,32 +202,21 @@ class NeuralTransitionModel(NetworkPair):
             )
         states, actions = as_rows(states, actions, len(self.cardinalities))
         outcomes = np.concatenate([next_states, terminated[:, None]], axis=1).astype(np.int64)
-        logits, probs = self._predict(states, actions)
+        rows = self._rows(states, actions)
         if self.config.conditioner is None:
             with np.errstate(divide="ignore"):
-                result: Floats = np.log(np.take_along_axis(probs, outcomes[:, :, None], axis=2)[:, :, 0]).sum(axis=1)
+                result: Floats = np.log(np.take_along_axis(rows.probs, outcomes[:, :, None], axis=2)[:, :, 0]).sum(axis=1)
             return result
-        return log_prob_causal(states, actions, outcomes, logits, probs, self._layout, self._packed_groups(), self.config.certain)
+        return log_prob_causal(rows, outcomes, self._packed_groups(), self.config.certain)
 
     def successors(self, states: States, actions: Actions, n_samples: int, seed: int) -> Successors:
         """See TransitionModel; systematic sampling (``systematic_sampling.py``) if probabilities are exact, else samples."""
         if self.config.conditioner == "others":
             return super().successors(states, actions, n_samples, seed)
-        states, actions = as_rows(states, actions, len(self.cardinalities))
-        logits, probs = self._predict(states, actions)
+        rows = self._rows(*as_rows(states, actions, len(self.cardinalities)))
         if self.config.conditioner is None:
-            return independent_successors(probs, self._layout.outputs, n_samples, seed)
-        return causal_successors(
-            states,
-            actions,
-            logits,
-            probs,
-            self._layout,
-            self._packed_groups(),
-            self.config.certain,
-            n_samples,
-            seed,
-        )
+            return independent_successors(rows.probs, self._layout.outputs, n_samples, seed)
+        return causal_successors(rows, self._packed_groups(), self.config.certain, n_samples, seed)
 
     def kernel(self) -> BitRules | None:
         """The truth tables of pruned networks, for compiled search (see ``models.kernel``); None if there are none."""
@@ -299,9 +256,9 @@ class NeuralTransitionModel(NetworkPair):
             self._groups = pack_groups(self.conditioner)
         return self._groups
 
-    def _predict(self, states: States, actions: Actions) -> tuple[Floats32, Floats]:
-        """The predictor's logits, float32 [B, O, K], and probabilities, float64 [B, O, K]."""
+    def _rows(self, states: States, actions: Actions) -> Rows:
+        """A batch with the predictor's results."""
         if self._forward is None:
-            self._forward = compiled_body(self.predictor, self._layout)
+            self._forward = compiled_body(self.predictor)
         logits = self._forward(states, actions)
-        return logits, probabilities(logits, self._layout.outputs)
+        return Rows(states, actions, logits, probabilities(logits, self._layout.outputs))

@@ -14,19 +14,20 @@ indexed, not sliced, since creating a slice would take longer than the work done
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from mbagent.models.kernel import Outcomes
 from mbagent.models.neural.kernels import (
+    FactorWork,
     Floats32,
     GroupWeights,
-    Layout,
+    Rows,
     active_columns,
     add_columns,
     add_next,
     copy_row,
+    factor_work,
     finish,
     next_place,
     trusted,
@@ -50,39 +51,32 @@ from mbagent.models.systematic_sampling import (
     write,
 )
 from mbagent.types import Floats, Ints, Keys
-from mbagent_envs.jit import borrowed, compiled, inlined
+from mbagent_envs.jit import compiled, inlined
 from mbagent_envs.random_keys import fill_row, uniform_at
+from mbagent_envs.structs import Struct
 
 
-class Work(NamedTuple):
+class Work(Struct):
     """Work space for one row.
 
     Attributes:
         columns: indices of ones, int64 [2 * O + n_steps].
         noise: random number of each factor, [O].
         sums: input of one group, [1, G].
-        row_logits: logits of one factor, [K].
-        given: distribution of that factor, [K].
+        factor: of one factor.
     """
 
     columns: Ints
     noise: Floats
     sums: Floats32
-    row_logits: Floats32
-    given: Floats
+    factor: FactorWork
 
 
-@compiled
-def work_space(layout: Layout, group: GroupWeights) -> Work:
-    """Work space for one row of a model of this shape."""
-    n_outputs, size, n_values = len(layout.outputs), group.bias.shape[1], group.offset.shape[1]
-    return Work(
-        np.empty(2 * n_outputs + layout.n_steps, dtype=np.int64),
-        np.empty(n_outputs, dtype=np.float64),
-        np.empty((1, size), dtype=np.float32),
-        np.empty(n_values, dtype=np.float32),
-        np.empty(n_values, dtype=np.float64),
-    )
+def work_space(group: GroupWeights) -> Work:
+    """Work space for one row of a model."""
+    n_outputs, size = len(group.group_of), group.bias.shape[1]
+    columns = np.empty(2 * n_outputs + group.layout.n_steps, dtype=np.int64)
+    return Work(columns, np.empty(n_outputs), np.empty((1, size), dtype=np.float32), factor_work(group))
 
 
 @inlined
@@ -122,111 +116,75 @@ def sample_independent(probs: Floats, outputs: Ints, keys: Keys) -> Ints:
     return factors
 
 
-@compiled
-def sample_causal(
-    states: Ints,
-    actions: Ints,
-    logits: Floats32,
-    probs: Floats,
-    keys: Keys,
-    layout: Layout,
-    group: GroupWeights,
-    certain: float,
-    greedy: bool,
-) -> Ints:
+def sample_causal(rows: Rows, keys: Keys, group: GroupWeights, certain: float, greedy: bool) -> Ints:
     """Ancestral samples int64 [B, O]: y_0, then y_1 given y_0, and so on; ``greedy`` takes the most likely values instead.
 
     A factor is sampled from the predictor if its most likely value has predicted probability at least ``certain``, or if it has
     no group in the conditioner. This is part of the model: ``log_prob_causal`` follows the same rule, so both are exact.
 
     Args:
-        states: int64 [B, F].
-        actions: int64 [B].
-        logits: the predictor's, float32 [B, O, K].
-        probs: the predictor's, float64 [B, O, K].
+        rows: the batch.
         keys: uint64 [B].
-        layout: the factors.
         group: the conditioner, masked "causal".
         certain: see above.
         greedy: see above.
     """
-    factors = np.empty((len(states), len(layout.outputs)), dtype=np.int64)
-    work = work_space(layout, group)
-    for b in range(len(states)):
-        _causal_row(b, states, actions[b], logits, probs, keys[b], layout, group, certain, greedy, work, factors)
+    factors = np.empty(rows.probs.shape[:2], dtype=np.int64)
+    _sample_causal(rows, keys, group, certain, greedy, work_space(group), factors)
     return factors
 
 
 @compiled
-def _causal_row(
-    b: int,
-    states: Ints,
-    action: int,
-    logits: Floats32,
-    probs: Floats,
-    key: np.uint64,
-    layout: Layout,
-    group: GroupWeights,
-    certain: float,
-    greedy: bool,
-    work: Work,
-    factors: Ints,
-) -> None:
-    """Row b of ``sample_causal``, to ``factors`` [B, O]."""
-    # The caller keeps all arrays alive, so that reference counting for every factor can be avoided.
-    states, logits, probs, factors = borrowed(states), borrowed(logits), borrowed(probs), borrowed(factors)
-    layout, group, w = borrowed(layout), borrowed(group), borrowed(work)
-    fill_row(key, w.noise)
-    n_columns, place = active_columns(states, b, action, layout, w.columns), 0
-    for i in range(len(layout.outputs)):
-        n, u = layout.outputs[i], w.noise[i]
-        if trusted(probs, b, i, layout, group, certain):
-            if n == 2:  # special case, as in sample_independent
-                value = int((0.5 if greedy else u) >= probs[b, i, 0] and probs[b, i, 1] > 0.0)
+def _sample_causal(rows: Rows, keys: Keys, group: GroupWeights, certain: float, greedy: bool, work: Work, factors: Ints) -> None:
+    states, probs, layout, columns = rows.states, rows.probs, group.layout, work.columns
+    for b in range(len(states)):
+        fill_row(keys[b], work.noise)
+        n_columns, place = active_columns(states, b, rows.actions[b], layout, columns), 0
+        for i in range(len(layout.outputs)):
+            n, u = layout.outputs[i], work.noise[i]
+            if trusted(rows, b, i, group, certain):
+                if n == 2:  # special case, as in sample_independent
+                    value = int((0.5 if greedy else u) >= probs[b, i, 0] and probs[b, i, 1] > 0.0)
+                else:
+                    value = largest(probs, b, i, n) if greedy else draw_at(probs, b, i, n, u)
             else:
-                value = largest(probs, b, i, n) if greedy else draw_at(probs, b, i, n, u)
-        else:
-            _condition(b, i, logits, layout, group, n_columns, w)
-            value = _likeliest(w.given, n) if greedy else draw(w.given, n, u)
-        factors[b, i] = value
-        n_columns = add_next(states, b, i, value, layout, group, w.columns, n_columns, place)
-        place = next_place(states, b, i, layout, place)
+                _condition(b, i, rows, group, n_columns, work)
+                value = _likeliest(work.factor.given, n) if greedy else draw(work.factor.given, n, u)
+            factors[b, i] = value
+            n_columns = add_next(states, b, i, value, group, columns, n_columns, place)
+            place = next_place(states, b, i, layout, place)
 
 
 @inlined
-def _condition(b: int, i: int, logits: Floats32, layout: Layout, group: GroupWeights, n_columns: int, w: Work) -> None:
-    """Writes factor i's distribution, given the columns that are 1, to ``w.given``."""
+def _condition(b: int, i: int, rows: Rows, group: GroupWeights, n_columns: int, w: Work) -> None:
+    """Writes factor i's distribution, given the columns that are 1, to ``w.factor.given``."""
     g = group.group_of[i]
     copy_row(group.bias, g, w.sums, 0)
     add_columns(group.columns, g, w.columns, n_columns, w.sums, 0)
-    finish(b, i, logits, layout, group, w.sums, 0, w.sums, w.row_logits, w.given)
+    finish(b, i, rows, group, w.sums, 0, w.factor)
+
+
+def log_prob_causal(rows: Rows, factors: Ints, group: GroupWeights, certain: float) -> Floats:
+    """Log-probability [B] of the outcomes ``factors`` [B, O] under the distribution of ``sample_causal``."""
+    result = np.zeros(len(factors))
+    _add_log_probs(rows, factors, group, certain, work_space(group), result)
+    return result
 
 
 @compiled
-def log_prob_causal(
-    states: Ints,
-    actions: Ints,
-    factors: Ints,
-    logits: Floats32,
-    probs: Floats,
-    layout: Layout,
-    group: GroupWeights,
-    certain: float,
-) -> Floats:
-    """Log-probability [B] of the outcomes ``factors`` [B, O] under the distribution of ``sample_causal``."""
-    result, work = np.zeros(len(states), dtype=np.float64), work_space(layout, group)
+def _add_log_probs(rows: Rows, factors: Ints, group: GroupWeights, certain: float, work: Work, result: Floats) -> None:
+    states, layout, columns = rows.states, group.layout, work.columns
     for b in range(len(states)):
-        n_columns, place = active_columns(states, b, actions[b], layout, work.columns), 0
+        n_columns, place = active_columns(states, b, rows.actions[b], layout, columns), 0
         for i in range(len(layout.outputs)):
             value = factors[b, i]
-            probability = probs[b, i, value]
-            if not trusted(probs, b, i, layout, group, certain):
-                _condition(b, i, logits, layout, group, n_columns, work)
-                probability = work.given[value]
+            probability = rows.probs[b, i, value]
+            if not trusted(rows, b, i, group, certain):
+                _condition(b, i, rows, group, n_columns, work)
+                probability = work.factor.given[value]
             result[b] += math.log(probability) if probability > 0.0 else -np.inf
-            n_columns = add_next(states, b, i, value, layout, group, work.columns, n_columns, place)
+            n_columns = add_next(states, b, i, value, group, columns, n_columns, place)
             place = next_place(states, b, i, layout, place)
-    return result
 
 
 @compiled
@@ -268,85 +226,89 @@ def _fits(probs: Floats, b: int, outputs: Ints, base: Ints, n_grid: int) -> bool
     return True
 
 
+class CausalWork(Struct):
+    """Work space for the successors of one row.
+
+    Attributes:
+        p: particles.
+        base: value of each factor if it is the only possible one, else -1, int64 [O].
+        open: the other factors, int64 [O].
+        active: indices of the input columns that are 1, int64 [O + n_steps].
+        columns: indices of further columns that are 1, int64 [O].
+        sums: input of one group, shared by all particles; and of one particle, [2, G].
+        factor: of one factor.
+    """
+
+    p: Particles
+    base: Ints
+    open: Ints
+    active: Ints
+    columns: Ints
+    sums: Floats32
+    factor: FactorWork
+
+
 @compiled
-def _causal(
-    states: Ints,
-    actions: Ints,
-    logits: Floats32,
-    probs: Floats,
-    layout: Layout,
-    group: GroupWeights,
-    certain: float,
-    p: Particles,
-    grid: Grid,
-    out: Outcomes,
-) -> int:
-    n_outputs, n_grid = probs.shape[1], grid[0]
-    base, still_open, columns = np.empty((3, n_outputs), dtype=np.int64)
-    active = np.empty(n_outputs + layout.n_steps, dtype=np.int64)
-    sums = np.empty((2, group.bias.shape[1]), dtype=np.float32)  # shared by all particles; of one particle
-    row_logits, hidden = np.empty(probs.shape[2], dtype=np.float32), np.empty((1, group.bias.shape[1]), dtype=np.float32)
-    values, total = np.empty(probs.shape[2], dtype=np.float64), 0
-    for b in range(len(states)):
-        n_active = active_columns(states, b, actions[b], layout, active)
+def _causal(rows: Rows, group: GroupWeights, certain: float, work: CausalWork, grid: Grid, out: Outcomes) -> int:
+    """Writes the successors of all rows to ``out``; returns their number."""
+    layout, probs, p, base, values = group.layout, rows.probs, work.p, work.base, work.factor.given
+    n_outputs, n_grid, total = probs.shape[1], grid[0], 0
+    for b in range(len(rows.states)):
+        n_active = active_columns(rows.states, b, rows.actions[b], layout, work.active)
         n_open, possible = 0, 1
         settle(probs, b, layout.outputs, base)
         for i in range(n_outputs):
-            if not (group.group_of[i] < 0 or trusted(probs, b, i, layout, group, certain)):
+            if not trusted(rows, b, i, group, certain):
                 base[i] = -1
             possible = min(possible * (layout.outputs[i] if base[i] < 0 else 1), n_grid + 1)
-        begin(p, n_grid, possible <= n_grid, place_of(states[b]))
+        begin(p, n_grid, possible <= n_grid, place_of(rows.states[b]))
         for i in range(n_outputs):
-            n, trust = layout.outputs[i], group.group_of[i] < 0 or trusted(probs, b, i, layout, group, certain)
+            n, trust = layout.outputs[i], trusted(rows, b, i, group, certain)
             if base[i] >= 0:
                 continue
-            still_open[n_open] = i
+            work.open[n_open] = i
             if trust:
                 values[:] = probs[b, i]
                 prune(values, n)
                 share_out(p, -1, i, n_open, values, n, i == n_outputs - 1, grid)
             else:
-                _known_input(i, base, active, n_active, layout, group, columns, sums)
+                _known_input(i, n_active, group, work)
             n_main, n_strata = p.state[MAIN], p.state[STRATA]
             for j in range(0 if trust else n_main + n_strata):
                 slot = n_grid + j if j < n_strata else j - n_strata  # strata first
-                copy_row(sums, 0, sums, 1)
-                n_columns = _open_columns(p.factors, slot, still_open, n_open, layout, group, columns)
-                add_columns(group.columns, group.group_of[i], columns, n_columns, sums, 1)
-                finish(b, i, logits, layout, group, sums, 1, hidden, row_logits, values)
+                copy_row(work.sums, 0, work.sums, 1)
+                n_columns = _open_columns(slot, n_open, group, work)
+                add_columns(group.columns, group.group_of[i], work.columns, n_columns, work.sums, 1)
+                finish(b, i, rows, group, work.sums, 1, work.factor)
                 prune(values, n)
                 share_out(p, slot, i, n_open, values, n, i == n_outputs - 1, grid)
             n_open += 1
-        out.counts[b] = write(p, base, still_open, n_open, n_grid, total, out)
+        out.counts[b] = write(p, base, work.open, n_open, n_grid, total, out)
         total += out.counts[b]
     return total
 
 
 @compiled
-def _known_input(
-    i: int, base: Ints, active: Ints, n_active: int, layout: Layout, group: GroupWeights, columns: Ints, sums: Floats32
-) -> None:
+def _known_input(i: int, n_active: int, group: GroupWeights, work: CausalWork) -> None:
     """Writes to ``sums[0]`` the input to factor i's group that a row's particles share, from (s, a) and settled factors."""
-    g, n = group.group_of[i], 0
+    layout, base, columns, g, n = group.layout, work.base, work.columns, group.group_of[i], 0
     for j in range(i):
         if base[j] >= 0 and (layout.outputs[j] != 2 or base[j] == 1):
             columns[n] = group.next_start + layout.start[j] + (0 if layout.outputs[j] == 2 else base[j])
             n += 1
-    copy_row(group.bias, g, sums, 0)
-    add_columns(group.columns, g, active, n_active, sums, 0)
-    add_columns(group.columns, g, columns, n, sums, 0)
+    copy_row(group.bias, g, work.sums, 0)
+    add_columns(group.columns, g, work.active, n_active, work.sums, 0)
+    add_columns(group.columns, g, columns, n, work.sums, 0)
 
 
 @compiled
-def _open_columns(
-    factors: Ints, q: int, still_open: Ints, n_open: int, layout: Layout, group: GroupWeights, columns: Ints
-) -> int:
-    """Writes the columns that are 1 for the open factors of particle ``q``; returns their number."""
-    n = 0
+def _open_columns(slot: int, n_open: int, group: GroupWeights, work: CausalWork) -> int:
+    """Writes the columns that are 1 for the open factors of the particle in ``slot``; returns their number."""
+    layout, n = group.layout, 0
     for w in range(n_open):
-        j, value = still_open[w], factors[q, w]
+        j, value = work.open[w], work.p.factors[slot, w]
         if layout.outputs[j] != 2 or value == 1:
-            columns[n] = group.next_start + layout.start[j] + (0 if layout.outputs[j] == 2 else value)
+            work.columns[n] = group.next_start + layout.start[j] + (0 if layout.outputs[j] == 2 else value)
             n += 1
     return n
 
@@ -368,24 +330,24 @@ def independent_successors(probs: Floats, outputs: Ints, n_samples: int, seed: i
     return listed(len(probs), n_samples, len(outputs), seed, write_rows)
 
 
-def causal_successors(
-    states: Ints,
-    actions: Ints,
-    logits: Floats32,
-    probs: Floats,
-    layout: Layout,
-    group: GroupWeights,
-    certain: float,
-    n_samples: int,
-    seed: int,
-) -> Successors:
+def causal_successors(rows: Rows, group: GroupWeights, certain: float, n_samples: int, seed: int) -> Successors:
     """Successors under a compiled causal conditioner.
 
     Arguments as in ``sample_causal``; ``n_samples`` and ``seed`` as in ``independent_successors``.
     """
-    p = new_particles(n_samples, probs.shape[1], probs.shape[2])
+    n_outputs, n_values = rows.probs.shape[1:]
+    work = CausalWork(
+        new_particles(n_samples, n_outputs, n_values),
+        np.empty(n_outputs, dtype=np.int64),
+        np.empty(n_outputs, dtype=np.int64),
+        np.empty(n_outputs + group.layout.n_steps, dtype=np.int64),
+        np.empty(n_outputs, dtype=np.int64),
+        np.empty((2, group.bias.shape[1]), dtype=np.float32),
+        factor_work(group),
+    )
 
-    def write_rows(rows: slice, grid: Grid, out: Outcomes) -> int:
-        return _causal(states[rows], actions[rows], logits[rows], probs[rows], layout, group, certain, p, grid, out)
+    def write_rows(some: slice, grid: Grid, out: Outcomes) -> int:
+        part = Rows(rows.states[some], rows.actions[some], rows.logits[some], rows.probs[some])
+        return _causal(part, group, certain, work, grid, out)
 
-    return listed(len(states), n_samples, len(layout.outputs), seed, write_rows)
+    return listed(len(rows.states), n_samples, n_outputs, seed, write_rows)

@@ -17,7 +17,7 @@ def test_the_compiled_predictor_is_the_torch_predictor(
     model = scrambled(cardinalities, 3, NeuralConfig(hidden=hidden, activation=activation, group_size=2))
     assert isinstance(model.predictor, DensePredictor)
     states, actions = random_rows(cardinalities, 3, 70)
-    compiled = compiled_body(model.predictor, model._layout)(states, actions)
+    compiled = compiled_body(model.predictor)(states, actions)
     np.testing.assert_allclose(compiled, in_chunks(model.predictor, states, actions), rtol=1e-4, atol=1e-4)
 
 

@@ -10,7 +10,7 @@ from mbagent.data import TransitionDataset
 from mbagent.models import DensePredictor, FactorCodec, NeuralConfig, NeuralTransitionModel, TrainingConfig
 from mbagent.models.neural.networks import Mask
 from mbagent_envs.geyser_runner import GeyserRunner
-from mbagent_envs.random_keys import derive
+from mbagent_envs.random_keys import derive, uniforms
 from tests.models.helpers import MIXED, QUICK, dataset, distribution, outcome_numbers, outcomes, played, random_rows, scrambled
 
 Ints = np.ndarray
@@ -226,6 +226,28 @@ def test_sweeps_reach_the_joint_distribution(real_guess: bool) -> None:
     assert ends.mean() < 0.01
     with pytest.raises(NotImplementedError, match="causal"):
         model.log_prob(sampled, np.zeros(n, dtype=np.int64), sampled, ends)
+
+
+@pytest.mark.parametrize("cardinalities", [(2, 2, 2, 2), MIXED, (2,)])
+def test_sweeps_resample_each_factor_given_all_others(cardinalities: tuple[int, ...]) -> None:
+    """Against the same draws with the torch networks, one factor at a time."""
+    model = scrambled(cardinalities, 3, NeuralConfig(conditioner="others", certain=1.0, sweeps=2, group_size=4))
+    assert model.conditioner is not None
+    states, actions = random_rows(cardinalities, 3, 60)
+    keys, (s, a) = derive(7, np.arange(60)), (torch.from_numpy(states), torch.from_numpy(actions))
+    probs, n_outputs = model.probabilities(states, actions), len(cardinalities) + 1
+    expected = (uniforms(keys, n_outputs)[:, :, None] >= probs.cumsum(axis=2)[:, :, :-1]).sum(axis=2)
+    for sweep in range(2):
+        sweep_keys = derive(keys, sweep)
+        noise, order = uniforms(sweep_keys, n_outputs), uniforms(derive(sweep_keys, 1 << 32), n_outputs).argsort(axis=1)
+        for step in range(n_outputs):
+            with torch.no_grad():
+                logits = model.predictor(s, a) + model.conditioner(s, a, torch.from_numpy(expected))
+            given = torch.softmax(logits.double(), dim=2).numpy().cumsum(axis=2)
+            for b, i in enumerate(order[:, step]):
+                expected[b, i] = (noise[b, i] >= given[b, i, : (*cardinalities, 2)[i] - 1]).sum()
+    sampled, ends = model.sample(states, actions, keys)
+    np.testing.assert_array_equal(np.concatenate([sampled, ends[:, None]], axis=1), expected)
 
 
 def test_the_papers_configuration_learns_its_own_example() -> None:
