@@ -196,7 +196,7 @@ def _planner(policy: PlannerPolicy, settings: PlannerSettings, like: Planner) ->
     assert policy.goal is not None  # checked in ``_single_state``
     planner.set_goal(policy.goal)
     if isinstance(planner, ValueIterationPlanner) and isinstance(like, ValueIterationPlanner):
-        planner.share_config(like)
+        planner.config = like.config
     return planner
 
 

@@ -477,42 +477,51 @@ def _thinned(
     offsets: Ints, terminated: Bools, probabilities: Floats, p: Particles, values: Floats, grid: Grid
 ) -> tuple[Ints, Ints, Floats]:
     """Number of successors kept in each row, and the indices and probabilities of all that are kept."""
-    n_rows, n_grid, total = len(offsets) - 1, grid[0], 0
-    counts, room = np.empty(n_rows, dtype=np.int64), len(probabilities)
-    chosen, weights = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.float64)
+    n_rows, room, total = len(offsets) - 1, len(probabilities), 0
+    counts, chosen = np.empty(n_rows, dtype=np.int64), np.empty(room, dtype=np.int64)
+    weights = np.empty(room, dtype=np.float64)
     for b in range(n_rows):
-        first, n = offsets[b], offsets[b + 1] - offsets[b]
+        n, first = thin_row(offsets[b], offsets[b + 1], terminated, probabilities, p, values, grid), offsets[b]
         counts[b] = n
-        if n <= n_grid:
-            for k in range(n):
-                chosen[total + k], weights[total + k] = first + k, probabilities[first + k]
-            total += n
-            continue
-        ends, ending = 0, 0.0
-        for k in range(first, first + n):
-            if terminated[k] and probabilities[k] > 0.0:
-                ends, ending = ends + 1, ending + probabilities[k]
-        others = n_possible(probabilities, first, n) - ends
-        begin(p, n_grid, False, 0)
-        p.factors[0, 0] = int(ends > 0)
-        if ends > 0 and others > 0:
-            bit_chances(ending, values)
-            share_out(p, -1, 0, 0, values, 2, True, grid)
-        n_main, n_strata = p.state[MAIN], p.state[STRATA]
-        for j in range(n_main + n_strata):
-            slot = n_grid + j if j < n_strata else j - n_strata  # strata first
-            left = 0.0
-            for k in range(n):
-                same = int(terminated[first + k]) == p.factors[slot, 0]
-                values[k] = probabilities[first + k] if same else 0.0
-                left += values[k]
-            for k in range(n):
-                values[k] /= left
-            share_out(p, slot, 1, 1, values, n, False, grid)
-        weigh(p, n_grid)
-        counts[b] = n_outcomes(p)
-        for i in range(counts[b]):
-            slot = slot_of(p, i, n_grid)
-            chosen[total + i], weights[total + i] = first + p.factors[slot, 1], p.chances[slot, MASS]
-        total += counts[b]
+        for i in range(n):
+            if p.state[LISTED]:
+                chosen[total + i], weights[total + i] = first + i, probabilities[first + i]
+            else:
+                slot = slot_of(p, i, grid[0])
+                chosen[total + i], weights[total + i] = first + p.factors[slot, 1], p.chances[slot, MASS]
+        total += n
     return counts, chosen[:total], weights[:total]
+
+
+@compiled
+def thin_row(first: int, end: int, terminated: Bools, probabilities: Floats, p: Particles, values: Floats, grid: Grid) -> int:
+    """Reduces the successors ``first`` ... ``end`` - 1 of a row if there are more than ``n_grid``; returns how many are kept.
+
+    All are kept if ``p.state[LISTED]`` is set. Otherwise, the particles hold those that are kept: number
+    ``p.factors[slot, 1]`` of the row with probability ``p.chances[slot, MASS]``. ``values`` has room for at least 2 numbers.
+    """
+    n, ends, ending = end - first, 0, 0.0
+    begin(p, grid[0], n <= grid[0], 0)
+    if n <= grid[0]:
+        return int(n)
+    for k in range(first, end):
+        if terminated[k] and probabilities[k] > 0.0:
+            ends, ending = ends + 1, ending + probabilities[k]
+    others = n_possible(probabilities, first, n) - ends
+    p.factors[0, 0] = int(ends > 0)
+    if ends > 0 and others > 0:
+        bit_chances(ending, values)
+        share_out(p, -1, 0, 0, values, 2, True, grid)
+    n_main, n_strata = p.state[MAIN], p.state[STRATA]
+    for j in range(n_main + n_strata):
+        slot = grid[0] + j if j < n_strata else j - n_strata  # strata first
+        left = 0.0
+        for k in range(n):
+            same = int(terminated[first + k]) == p.factors[slot, 0]
+            values[k] = probabilities[first + k] if same else 0.0
+            left += values[k]
+        for k in range(n):
+            values[k] /= left
+        share_out(p, slot, 1, 1, values, n, False, grid)
+    weigh(p, grid[0])
+    return n_outcomes(p)

@@ -16,11 +16,61 @@ from numpy.typing import NDArray
 from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.models.base import BaseTransitionModel, ExactModel
 from mbagent.models.fit_report import FitReport
+from mbagent.models.kernel import Outcomes, work_for
 from mbagent.models.protocol import Successors, as_keys
-from mbagent.models.systematic_sampling import thin
-from mbagent.types import Actions, Bools, Floats, Randomness, States
+from mbagent.models.systematic_sampling import LISTED, MASS, Particles, new_particles, slot_of, thin, thin_row
+from mbagent.types import Actions, Bools, Floats, Ints, Randomness, States
 from mbagent_envs.jit import compiled
 from mbagent_envs.random_keys import derive, hash_rows, uniforms
+from mbagent_envs.structs import Struct
+
+
+class TableWork(Struct):
+    """Work space: particles, and a number for each outcome of a pair, [at least 2]."""
+
+    p: Particles
+    values: Floats
+
+
+@compiled
+def table_outcomes(
+    kernel: TableKernel, work: TableWork, state: Ints, n_grid: int, key: np.uint64, offset: float, out: Outcomes
+) -> int:
+    """See ``Kernel.outcomes``."""
+    p, total = work.p, 0
+    for action in range(kernel.n_actions):
+        pair = state[0] * kernel.n_actions + action
+        first, end = kernel.offsets[pair], kernel.offsets[pair + 1]
+        n = thin_row(first, end, kernel.terminated, kernel.probabilities, p, work.values, (n_grid, key, offset))
+        for i in range(n):
+            entry, probability = first + i, kernel.probabilities[first + i]
+            if not p.state[LISTED]:
+                slot = slot_of(p, i, n_grid)
+                entry, probability = first + p.factors[slot, 1], p.chances[slot, MASS]
+            out.states[total + i, 0], out.terminated[total + i] = kernel.next_states[entry], kernel.terminated[entry]
+            out.probabilities[total + i] = probability
+        out.counts[action], out.left_out[action] = n, p.left[0]
+        total += n
+    return total
+
+
+class TableKernel(Struct):
+    """A table for compiled search; see ``TabularMDP`` for the attributes."""
+
+    offsets: Ints
+    next_states: Ints
+    terminated: Bools
+    probabilities: Floats
+    n_actions: int
+
+    outcomes = staticmethod(table_outcomes)
+
+
+@work_for.register
+def table_work(kernel: TableKernel, n_grid: int) -> TableWork:
+    """See ``models.kernel.work_for``."""
+    most = max(2, int(np.diff(kernel.offsets).max(initial=0)))
+    return TableWork(new_particles(n_grid, 2, most), np.empty(most))
 
 
 class TabularMDP(ExactModel):
@@ -50,7 +100,8 @@ class TabularMDP(ExactModel):
         """See the class."""
         n_states, rest = divmod(len(offsets) - 1, n_actions)
         super().__init__((n_states,), n_actions)
-        self.offsets, self.next_states, self.terminated, self.probabilities = offsets, next_states, terminated, probabilities
+        self.offsets, self.next_states = np.ascontiguousarray(offsets), np.ascontiguousarray(next_states)
+        self.terminated, self.probabilities = np.ascontiguousarray(terminated), np.ascontiguousarray(probabilities)
         self._start = start
         totals = np.add.reduceat(probabilities, offsets[:-1]) if len(probabilities) else np.zeros(0)
         lengths = {len(next_states), len(terminated), len(probabilities), int(offsets[-1])}
@@ -71,6 +122,10 @@ class TabularMDP(ExactModel):
         entries = np.arange(offsets[-1]) + np.repeat(self.offsets[pairs] - offsets[:-1], counts)
         found = Successors(offsets, self.next_states[entries, None], self.terminated[entries], self.probabilities[entries])
         return thin(found, n_samples, seed)
+
+    def kernel(self) -> TableKernel:
+        """The table for compiled search."""
+        return TableKernel(self.offsets, self.next_states, self.terminated, self.probabilities, self.n_actions)
 
     def sample(self, states: States, actions: Actions, rng: Randomness) -> tuple[States, Bools]:
         """See TransitionModel."""

@@ -91,22 +91,19 @@ class ValueIterationPlanner:
         self._start: States | None = None
         self._mdp: SolvedMdp | None = None
         self._expanded: StateGraph | None = None
-        self._config: LookaheadConfig | None = None
+        self.config: LookaheadConfig | None = None
+        """Lookahead configuration for the goal; if None, it is chosen when the first lookahead is needed."""
         self._warned = False
 
     def set_model(self, model: TransitionModel, start_states: States) -> None:
         """See Planner. The reachable MDP is generated at the next ``plan``."""
-        self._model, self._start, self._mdp, self._expanded, self._config = model, start_states, None, None, None
+        self._model, self._start, self._mdp, self._expanded, self.config = model, start_states, None, None, None
 
     def set_goal(self, goal: Reward) -> None:
         """See Planner. The reachable MDP is kept, its values are dropped."""
         if self._mdp is not None:
             self._mdp.values = None  # before the goal changes, so that an interrupt cannot leave values of another goal
-        self._goal, self._config, self._warned = goal, None, False
-
-    def share_config(self, other: ValueIterationPlanner) -> None:
-        """Copies the lookahead configuration of another planner with the same model and goal, if that planner has chosen one."""
-        self._config = other._config
+        self._goal, self.config, self._warned = goal, None, False
 
     def plan(self, roots: States) -> Plan:
         """See Planner."""
@@ -180,13 +177,13 @@ class ValueIterationPlanner:
 
     def _chosen_config(self) -> LookaheadConfig:
         """Lookahead configuration for this goal: the one in the settings, or the winner of a race if leaf values are learned."""
-        if self._config is None:
+        if self.config is None:
             settings, start = self.settings, self._start
             default = LookaheadConfig(LOWEST_KNOWN, settings.lookahead_states, settings.lookahead_samples)
             if settings.learn_values and start is not None and len(start):
                 default = self._race(default, Task(self._known_model(), self._known_goal(), start, settings.gamma, settings.seed))
-            self._config = default
-        return self._config
+            self.config = default
+        return self.config
 
     def _race(self, default: LookaheadConfig, task: Task) -> LookaheadConfig:
         """Learns the goal's leaf values; races lookaheads with them, without them, and with them expanding only the root."""
@@ -196,7 +193,7 @@ class ValueIterationPlanner:
             return default
 
         def act(config: LookaheadConfig, states: States) -> Actions:
-            racer._config = config
+            racer.config = config
             return best_actions(racer._expand(states).scores)
 
         racer = type(self)(replace(settings, **RACED))
@@ -360,9 +357,9 @@ class _Search:
     def _result(self) -> Expanded:
         graph, roots, t = self.graph, self.tree.roots, self.tree
         n, m, visits = len(graph), graph.n_edges, t.root_visits
-        solution = Values(t.v[:n], t.q[:n], t.rewards[:m], t.frontier, t.leaf)
+        solution = replace(t.values, v=t.values.v[:n], q=t.values.q[:n], rewards=t.values.rewards[:m])
         if self.settings.backup == "mean":
-            return Expanded(graph, roots, solution, visits, visits + 1e-6 * _scaled(t.q[roots]), t.visits[:n])
+            return Expanded(graph, roots, solution, visits, visits + 1e-6 * _scaled(solution.q[roots]), t.visits[:n])
         settle(graph, solution, self.settings.gamma, FINAL_SWEEPS)
         return Expanded(graph, roots, solution, visits, break_ties(graph, solution.q, roots, self.settings.gamma))
 
@@ -378,7 +375,7 @@ class _Search:
             n_samples = self.settings.n_samples if rules.rollouts else LEAF_SAMPLES
             graph.expand(nodes, n_samples, int(_key(self.settings.seed, done + 1)))
             self._make_room()
-            self.tree.rewards[n_edges : graph.n_edges] = score_edges(graph, self.planner._known_goal(), n_edges)
+            self.tree.values.rewards[n_edges : graph.n_edges] = score_edges(graph, self.planner._known_goal(), n_edges)
             if rules.rollouts:
                 self._roll_out(batch, done, size)
             take_in(graph.arrays, self.tree, rules, batch, n_nodes, nodes, n_widened)
@@ -388,11 +385,12 @@ class _Search:
     def _make_room(self) -> None:
         """Enlarges the statistics to the size of the graph."""
         tree, n, m = self.tree, len(self.graph), self.graph.n_edges
-        if len(tree.v) < n:
-            v, q, visits, counted = (_longer(table, 2 * n) for table in (tree.v, tree.q, tree.visits, tree.counted))
-            tree = replace(tree, v=v, q=q, visits=visits, counted=counted)
-        if len(tree.rewards) < m:
-            tree = replace(tree, rewards=_longer(tree.rewards, 2 * m))
+        if len(tree.values.v) < n:
+            visits, counted = _longer(tree.visits, 2 * n), _longer(tree.counted, 2 * n)
+            values = replace(tree.values, v=_longer(tree.values.v, 2 * n), q=_longer(tree.values.q, 2 * n))
+            tree = replace(tree, values=values, visits=visits, counted=counted)
+        if len(tree.values.rewards) < m:
+            tree = replace(tree, values=replace(tree.values, rewards=_longer(tree.values.rewards, 2 * m)))
         self.tree = tree
 
     def _roll_out(self, batch: Batch, done: int, size: int) -> None:
@@ -409,11 +407,9 @@ class _Search:
 
 def _first_tree(solution: Values, roots: Ints) -> SearchTree:
     """Statistics before the first simulation."""
-    q, spread = solution.q, solution.v[roots]
-    return SearchTree(
-        roots, solution.v, q, np.zeros_like(q), np.zeros_like(q), solution.rewards, solution.frontier,
-        np.zeros((len(roots), q.shape[1])), np.ones(len(roots)), np.stack([spread, spread], axis=1), solution.leaf,
-    )  # fmt: skip
+    spread, n_visits = solution.v[roots], np.zeros_like(solution.q)
+    root_visits, extremes = np.zeros((len(roots), solution.q.shape[1])), np.stack([spread, spread], axis=1)
+    return SearchTree(roots, solution, n_visits, n_visits.copy(), root_visits, np.ones(len(roots)), extremes)
 
 
 @lru_cache(maxsize=4096)

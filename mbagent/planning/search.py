@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from mbagent.models.mdp import GraphArrays, StateGraph, add_edge, add_node
-from mbagent.planning.value_iteration import TOLERANCE, LeafValues, bellman, leaf_value, sweep
+from mbagent.planning.value_iteration import Values, bellman, leaf_value, sweep
 from mbagent.types import Floats, Ints
 from mbagent_envs.jit import compiled, inlined
 from mbagent_envs.random_keys import uniform_at
@@ -48,29 +48,21 @@ class SearchTree(Struct):
 
     Attributes:
         roots: nodes from which simulations start, int64 [R].
-        v: value of each node, [room].
-        q: value of each action in each node, [room, A].
+        values: of all nodes, [room, ...].
         visits: visit count of each action in each node, [room, A].
         counted: number of averaged returns, [room, A].
-        rewards: reward of each edge, [room].
-        frontier: value of each group's unexpanded nodes if no values are learned, [G].
         root_visits: number of simulations that start with each root action, [R, A].
         spans: range of the values around each root, [R].
         extremes: lowest and highest return of each root, [R, 2].
-        leaf: learned values of unexpanded nodes.
     """
 
     roots: Ints
-    v: Floats
-    q: Floats
+    values: Values
     visits: Floats
     counted: Floats
-    rewards: Floats
-    frontier: Floats
     root_visits: Floats
     spans: Floats
     extremes: Floats
-    leaf: LeafValues
 
 
 class Batch(Struct):
@@ -168,7 +160,7 @@ def select(tree: SearchTree, node: int, prior_visits: float, weight: float) -> i
 
     The bound is infinite without visits. ``weight`` is that of exploration, times the range of values.
     """
-    q, visits = tree.q, tree.visits
+    q, visits = tree.values.q, tree.visits
     n_simulations = 0.0
     for a in range(q.shape[1]):
         n_simulations += visits[node, a]
@@ -229,21 +221,21 @@ def take_in(
         expanded: the expanded nodes, sorted.
         n_widened: number of nodes in ``batch.widened``.
     """
-    n, m = graph.sizes[0], graph.sizes[1]
-    v, q, rewards, known = tree.v[:n], tree.q[:n], tree.rewards[:m], len(tree.leaf.common) > 0
-    for node in range(n_before, n):
-        v[node] = leaf_value(tree.leaf, graph.states[node]) if known else tree.frontier[graph.groups[node]]
+    values, v, q = tree.values, tree.values.v, tree.values.q
+    known = len(values.leaf.common) > 0
+    for node in range(n_before, graph.sizes[0]):
+        v[node] = leaf_value(values.leaf, graph.states[node]) if known else values.frontier[graph.groups[node]]
         for a in range(q.shape[1]):
             q[node, a], tree.visits[node, a], tree.counted[node, a] = 0.0, 0.0, 0.0
     if rules.rollouts:
         return
     for node in expanded:
-        v[node] = bellman(node, graph, rewards, rules.gamma, v, q)
+        v[node] = bellman(node, graph, values.rewards, rules.gamma, v, q)
     if n_widened > 0:  # no path leads there, so no backup would propagate their values
-        active = np.zeros(len(tree.frontier), dtype=np.bool_)
+        active = np.zeros(len(values.frontier), dtype=np.bool_)
         for i in range(n_widened):
             active[graph.groups[batch.widened[i]]] = True
-        sweep(graph, rewards, rules.gamma, TOLERANCE, WIDENING_SWEEPS, active, v, q, tree.frontier, tree.leaf)
+        sweep(graph, values, rules.gamma, WIDENING_SWEEPS, active)
 
 
 @compiled
@@ -252,7 +244,7 @@ def backup(graph: GraphArrays, tree: SearchTree, rules: SearchRules, batch: Batc
     for r in range(len(tree.roots)):
         for w in range(size):
             if not rules.rollouts:
-                batch.end_values[r, w] = tree.v[batch.ends[r, w]] if batch.ends[r, w] >= 0 else 0.0
+                batch.end_values[r, w] = tree.values.v[batch.ends[r, w]] if batch.ends[r, w] >= 0 else 0.0
     for r in range(len(tree.roots)):
         for w in range(size):
             if rules.mean:
@@ -270,9 +262,10 @@ def backup(graph: GraphArrays, tree: SearchTree, rules: SearchRules, batch: Batc
 @inlined
 def _back_up_max(graph: GraphArrays, tree: SearchTree, rules: SearchRules, batch: Batch, r: int, w: int) -> None:
     """Bellman backups along a path, from its end to the root: trial-based heuristic tree search (Keller & Helmert 2013)."""
+    values = tree.values
     for step in range(batch.lengths[r, w] - 1, -1, -1):
         node = graph.sources[batch.edges[r, w, step]]
-        tree.v[node] = bellman(node, graph, tree.rewards, rules.gamma, tree.v, tree.q)
+        values.v[node] = bellman(node, graph, values.rewards, rules.gamma, values.v, values.q)
 
 
 @inlined
@@ -281,13 +274,13 @@ def _back_up_mean(graph: GraphArrays, tree: SearchTree, rules: SearchRules, batc
 
     The initial value counts as ``prior_visits`` returns.
     """
-    total = batch.end_values[r, w]
+    total, q, rewards = batch.end_values[r, w], tree.values.q, tree.values.rewards
     for step in range(batch.lengths[r, w] - 1, -1, -1):
         edge = batch.edges[r, w, step]
         node, a = graph.sources[edge], graph.actions[edge]
-        total = tree.rewards[edge] + rules.gamma * total
+        total = rewards[edge] + rules.gamma * total
         tree.counted[node, a] += 1.0
-        tree.q[node, a] += (total - tree.q[node, a]) / (rules.prior_visits + tree.counted[node, a])
+        q[node, a] += (total - q[node, a]) / (rules.prior_visits + tree.counted[node, a])
     tree.extremes[r, 0], tree.extremes[r, 1] = min(tree.extremes[r, 0], total), max(tree.extremes[r, 1], total)
 
 
@@ -297,17 +290,17 @@ def measure_spans(graph: GraphArrays, tree: SearchTree) -> None:
 
     The range is at least the largest probability times absolute reward of an edge.
     """
-    n_groups = len(tree.frontier)
+    v, rewards, n_groups = tree.values.v, tree.values.rewards, len(tree.values.frontier)
     low, high = np.empty(n_groups, dtype=np.float64), np.empty(n_groups, dtype=np.float64)
     for g in range(n_groups):
         low[g], high[g] = np.inf, -np.inf
     for node in range(graph.sizes[0]):
         if graph.expanded[node]:
             g = graph.groups[node]
-            low[g], high[g] = min(low[g], tree.v[node]), max(high[g], tree.v[node])
+            low[g], high[g] = min(low[g], v[node]), max(high[g], v[node])
     for edge in range(graph.sizes[1]):
         g = graph.groups[graph.sources[edge]]
-        high[g] = max(high[g], low[g] + graph.probabilities[edge] * abs(tree.rewards[edge]))
+        high[g] = max(high[g], low[g] + graph.probabilities[edge] * abs(rewards[edge]))
     for r in range(len(tree.roots)):
         span = high[graph.groups[tree.roots[r]]] - low[graph.groups[tree.roots[r]]]
         tree.spans[r] = span if 0.0 < span < np.inf else 1.0
@@ -355,14 +348,12 @@ def carry_over(old: StateGraph, tree: SearchTree, root: int, new: StateGraph) ->
     nodes, edges = np.empty(len(old), dtype=np.int64), np.empty(old.n_edges, dtype=np.int64)
     _copy_reachable(old.arrays, new.arrays, root, nodes, edges)
     nodes, edges = nodes[: len(new)], edges[: new.n_edges]
-    visits = tree.visits[nodes]
+    values, visits = tree.values, tree.visits[nodes]
     return replace(
         tree,
         roots=np.zeros(1, dtype=np.int64),
-        v=tree.v[nodes],
-        q=tree.q[nodes],
+        values=replace(values, v=values.v[nodes], q=values.q[nodes], rewards=values.rewards[edges]),
         visits=visits,
         counted=tree.counted[nodes],
-        rewards=tree.rewards[edges],
         root_visits=visits[:1].copy(),
     )

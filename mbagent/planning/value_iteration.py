@@ -5,8 +5,6 @@ The value function is linear in features and in pairs of features.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -103,9 +101,8 @@ VALUE_TIE = 1e-6
 MAX_NEWS_SWEEPS = 200
 
 
-@dataclass
-class Values:
-    """Solution of a state graph for a goal.
+class Values(Struct):
+    """Values of a state graph for a goal; a search keeps spare room for further nodes and edges.
 
     Attributes:
         v: float64 [N], value of each state: that of the best action if expanded, else that given by ``leaf`` or ``frontier``.
@@ -168,7 +165,7 @@ def settle(graph: StateGraph, values: Values, gamma: float, max_sweeps: int = MA
         only: bool [G], the groups to update; None for all.
     """
     active = np.ones(len(values.frontier), dtype=np.bool_) if only is None else only.copy()
-    sweep(graph.arrays, values.rewards, gamma, TOLERANCE, max_sweeps, active, values.v, values.q, values.frontier, values.leaf)
+    sweep(graph.arrays, values, gamma, max_sweeps, active)
 
 
 @compiled
@@ -202,32 +199,18 @@ def _set_frontier(graph: GraphArrays, active: Bools, lows: Floats, moved: Floats
         if active[g]:
             moved[g] = max(moved[g], abs(lows[g] - frontier[g]))
             frontier[g] = lows[g]
-    for s in range(len(v)):
+    for s in range(graph.sizes[0]):
         if active[graph.groups[s]] and not graph.expanded[s]:
             v[s] = frontier[graph.groups[s]]
 
 
 @compiled
-def sweep(
-    graph: GraphArrays,
-    rewards: Floats,
-    gamma: float,
-    tolerance: float,
-    max_sweeps: int,
-    active: Bools,
-    v: Floats,
-    q: Floats,
-    frontier: Floats,
-    leaf: LeafValues,
-) -> None:
-    """Sweeps over the ``active`` groups [G]; updates ``v``, ``q`` and ``frontier`` (see Values) and overwrites ``active``.
-
-    ``rewards`` has one entry for each edge in use; ``v`` and ``q`` have one row for each node in use.
-    """
+def sweep(graph: GraphArrays, values: Values, gamma: float, max_sweeps: int, active: Bools) -> None:
+    """Sweeps over the ``active`` groups [G]; updates the values and overwrites ``active``."""
     # Every group has its own stopping criterion: its values must not depend on the other groups of the same call.
-    n_groups = len(frontier)
+    v, q, rewards, n, n_groups = values.v, values.q, values.rewards, graph.sizes[0], len(values.frontier)
     lows, moved, scale = np.zeros(n_groups), np.zeros(n_groups), np.zeros(n_groups)
-    for s in range(len(v)):
+    for s in range(n):
         for a in range(q.shape[1]):
             expected = 0.0  # expected rewards, since a rare reward may be a thousand times larger than any other
             for e in range(graph.first[s, a], graph.first[s, a] + graph.counts[s, a]):
@@ -236,7 +219,7 @@ def sweep(
     for _ in range(max_sweeps):
         for g in range(n_groups):
             moved[g], lows[g] = 0.0, np.inf
-        for s in range(len(v) - 1, -1, -1):
+        for s in range(n - 1, -1, -1):
             g = graph.groups[s]
             if not (active[g] and graph.expanded[s]):
                 continue
@@ -244,9 +227,9 @@ def sweep(
             moved[g] = max(moved[g], abs(best - v[s]))
             v[s] = best
             lows[g] = min(lows[g], best)
-        if len(leaf.common) == 0:
-            _set_frontier(graph, active, lows, moved, v, frontier)
-        if not _still_active(active, moved, tolerance, scale):
+        if len(values.leaf.common) == 0:
+            _set_frontier(graph, active, lows, moved, v, values.frontier)
+        if not _still_active(active, moved, TOLERANCE, scale):
             break
 
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from mbagent import ModelLearningAgent
+from mbagent.models.mdp import StateGraph
 from mbagent.models.tabular import TabularMDP, toy_text_model
 from mbagent_envs.random_keys import derive
 
@@ -50,3 +51,22 @@ def test_a_world_without_a_table_and_a_table_with_holes_are_refused() -> None:
     ones = np.ones(2)
     with pytest.raises(ValueError, match="summing to one"):
         TabularMDP(np.array([0, 1, 2]), np.zeros(2, np.int64), ones == 0, ones / 2, 1, np.zeros(1, np.int64))
+
+
+@pytest.mark.parametrize("draws", [1, 3, 4, 40])
+def test_compiled_expansion_equals_the_successors(draws: int) -> None:
+    """Of pairs with one to seven outcomes, some of which terminate."""
+    rng = np.random.default_rng(0)
+    counts = rng.integers(1, 8, size=12 * 3)
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    probabilities = np.concatenate([rng.dirichlet(np.full(n, 0.3)) for n in counts])
+    following = np.concatenate([rng.choice(12, n, replace=False) for n in counts])
+    model = TabularMDP(offsets, following, rng.random(len(following)) < 0.2, probabilities, 3, np.arange(12))
+    compiled, plain = StateGraph(model), StateGraph(model)
+    plain.kernel = None
+    for graph in (compiled, plain):
+        nodes = graph.add(np.arange(12)[:, None], np.zeros(12, dtype=np.int64))
+        graph.expand(nodes, draws, seed=draws)
+    assert compiled.kernel is not None
+    for name in ("sources", "actions", "next_nodes", "terminated", "probabilities", "first", "counts"):
+        np.testing.assert_array_equal(getattr(compiled, name), getattr(plain, name), err_msg=name)

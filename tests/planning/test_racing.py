@@ -83,8 +83,8 @@ def test_learned_values_are_used_if_they_perform_better(kind: type[ValueIteratio
     states = np.eye(N_BULBS, dtype=np.int64)[:5] ^ 1
     found = planner(kind)
     np.testing.assert_array_equal(found.plan(states).actions, np.arange(1, 6))
-    assert found._config is not None
-    assert len(found._config.leaf.weights)
+    assert found.config is not None
+    assert len(found.config.leaf.weights)
 
 
 def test_plans_do_not_depend_on_the_batch() -> None:
@@ -101,18 +101,18 @@ def test_racing_uses_neither_time_budget_nor_reuse() -> None:
     timed.plan(START)
     assert timed.settings.time_budget == 0.01
     assert timed.settings.reuse_tree
-    assert timed._config is not None
-    assert planner()._chosen_config().states == timed._config.states
+    assert timed.config is not None
+    assert planner()._chosen_config().states == timed.config.states
 
 
 def test_values_are_dropped_with_their_goal() -> None:
     made = planner()
     made.plan(START)
-    first = made._config
+    first = made.config
     made.set_goal(lambda s, a, n: -count_bits(s, a, n))
-    assert made._config is None
+    assert made.config is None
     assert made.plan(START).actions[0] == 0
-    assert made._config is not first
+    assert made.config is not first
 
 
 def test_a_goal_that_fails_while_values_are_learned_leaves_the_planner_usable() -> None:
@@ -136,6 +136,6 @@ def test_a_goal_that_fails_while_values_are_learned_leaves_the_planner_usable() 
 def test_learning_values_can_be_switched_off() -> None:
     made = planner(learn_values=False)
     made.plan(START)
-    assert made._config == LookaheadConfig(LOWEST_KNOWN, 4, made.settings.lookahead_samples)
+    assert made.config == LookaheadConfig(LOWEST_KNOWN, 4, made.settings.lookahead_samples)
     with pytest.raises(ValueError, match="learn_values must be True or False"):
         settings(learn_values=1)

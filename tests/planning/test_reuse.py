@@ -43,8 +43,8 @@ def test_reused_statistics_are_those_of_the_last_search(kind: str) -> None:
     taken = carry_over(old, tables, root, new)
     assert new.states[0].tolist() == old.states[root].tolist()
     back = old.find(new.states)
-    np.testing.assert_array_equal(taken.q, tables.q[back])
-    np.testing.assert_array_equal(taken.v, tables.v[back])
+    np.testing.assert_array_equal(taken.values.q, tables.values.q[back])
+    np.testing.assert_array_equal(taken.values.v, tables.values.v[back])
     np.testing.assert_array_equal(new.expanded, old.expanded[back])
     np.testing.assert_array_equal(taken.root_visits[0], tables.visits[root])
     for node, action in np.ndindex(new.counts.shape):
@@ -52,7 +52,7 @@ def test_reused_statistics_are_those_of_the_last_search(kind: str) -> None:
         there = slice(old.first[back[node], action], old.first[back[node], action] + old.counts[back[node], action])
         np.testing.assert_array_equal(new.probabilities[here], old.probabilities[there])
         np.testing.assert_array_equal(new.states[new.next_nodes[here]], old.states[old.next_nodes[there]])
-        np.testing.assert_array_equal(taken.rewards[here], tables.rewards[there])
+        np.testing.assert_array_equal(taken.values.rewards[here], tables.values.rewards[there])
 
 
 @pytest.mark.parametrize("kind", list(KINDS))

@@ -105,7 +105,9 @@ class NeuralTransitionModel(NetworkPair):
         train, held_out = examples(rows[0]), examples(rows[1])
         trainer = Trainer(self.codec, self.predictor, self.conditioner, self.config.training)
         try:
-            epochs = prune_networks(trainer, self.connections(), fraction, train, held_out, len(rows[0]), seed, progress, config)
+            epochs = prune_networks(
+                trainer, self.connections(), fraction, (train, held_out), len(rows[0]), seed, progress, config
+            )
             pair = self._pair()
             marks = find_parents(pair, train) if pair else NO_MARKS
         except BaseException:

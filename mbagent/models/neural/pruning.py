@@ -384,8 +384,7 @@ def prune_networks(
     trainer: Trainer,
     connections: Mapping[str, Connections],
     fraction: float,
-    train: Examples,
-    held_out: Examples,
+    data: tuple[Examples, Examples],
     n_transitions: int,
     seed: int,
     progress: Progress | None,
@@ -397,14 +396,14 @@ def prune_networks(
         trainer: trainer of the networks.
         connections: connections of "predictor" and, if there is one, "conditioner".
         fraction: minimum share of each network's connections to remove.
-        train: training examples.
-        held_out: examples for the selection of the best weights.
+        data: training examples, and examples for the selection of the best weights.
         n_transitions: number of transitions that the training examples represent.
         seed: seed of the batches.
         progress: called with the completed share.
         config: see PruningConfig.
     """
     config, generator = config or PruningConfig(), torch.Generator().manual_seed(seed + BATCHES)
+    train, held_out = data
     both = "conditioner" in connections and connections["conditioner"].total > 0
     predictor, conditioner = trainer.predictor, trainer.conditioner
     half = progress if progress is None or trainer.conditioner is None else lambda share: progress(0.5 * share)

@@ -326,12 +326,12 @@ class RulesWork(Struct):
 
 
 @inlined
-def _by_outcome(q: int, place: int, weight: int, v: int, end: int, parents: Ints, base: Ints, slot: Ints, factors: Ints) -> int:
+def _by_outcome(q: int, place: int, weight: int, v: int, end: int, parents: Ints, work: RulesWork) -> int:
     """Adds the values of parents ``v:end`` in particle q to index ``place``; the first has stride ``weight``."""
     while v < end:
-        value = base[parents[v]]
+        value = work.base[parents[v]]
         if value < 0:
-            value = factors[q, slot[parents[v]]]
+            value = work.p.factors[q, work.slot[parents[v]]]
         place += weight * value
         weight *= 2
         v += 1
@@ -358,7 +358,7 @@ def rules_outcomes(k: BitRules, work: RulesWork, state: Ints, n_grid: int, key: 
     """See ``models.kernel``."""
     table, bits, parents, base, slot = k.table, k.bits, k.parents, work.base, work.slot
     grid, total, still_open, p = (n_grid, key, offset), 0, work.open, work.p
-    factors, values = p.factors, np.empty(2, dtype=np.float64)
+    values = np.empty(2, dtype=np.float64)
     _copy(state, k.copies, base)
     last = len(base) - 1
     for action in range(k.n_actions):
@@ -371,7 +371,7 @@ def rules_outcomes(k: BitRules, work: RulesWork, state: Ints, n_grid: int, key: 
             for v in range(start, end):
                 shared = shared and base[parents[v]] >= 0
             if shared:  # the same for all particles
-                chance = table[_by_outcome(0, place, weight, start, end, parents, base, slot, factors)]
+                chance = table[_by_outcome(0, place, weight, start, end, parents, work)]
                 if chance <= 0.0 or chance >= 1.0:
                     base[i] = int(chance >= 1.0)
                     continue
@@ -382,7 +382,7 @@ def rules_outcomes(k: BitRules, work: RulesWork, state: Ints, n_grid: int, key: 
             n_main, n_strata = p.state[MAIN], p.state[STRATA]
             for j in range(0 if shared else n_main + n_strata):
                 q = n_grid + j if j < n_strata else j - n_strata  # strata first
-                bit_chances(table[_by_outcome(q, place, weight, start, end, parents, base, slot, factors)], values)
+                bit_chances(table[_by_outcome(q, place, weight, start, end, parents, work)], values)
                 share_out(p, q, i, n_open, values, 2, i == last, grid)
             n_open += 1
         out.counts[action] = _write_outcomes(total, base, still_open[:n_open], p, n_grid, out)

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from mbagent.planning.planner import PlannerSettings
+from mbagent.planning.planners import MctsPlanner
 from mbagent.types import Ints
-from studies.planning.graph_search import GraphSearch
 from studies.planning.networks import AT_ONCE, BUDGETS, SEEDS, NetworkTask, PairwiseGoal, PeerOnNetworks
 
 MCTX = "mctx, Gumbel MuZero"
@@ -105,7 +105,7 @@ class RatioRow:
     simulations_ratio: float
 
 
-def planner_for(task: NetworkTask, goal: PairwiseGoal, effort: Effort, seed: int) -> GraphSearch:
+def planner_for(task: NetworkTask, goal: PairwiseGoal, effort: Effort, seed: int) -> MctsPlanner:
     """The library's search. It has no start states, so each decision includes the cost of all its expansions."""
     settings = PlannerSettings(
         num_simulations=effort.simulations,
@@ -116,7 +116,7 @@ def planner_for(task: NetworkTask, goal: PairwiseGoal, effort: Effort, seed: int
         batch_size=BATCH,
         seed=seed,
     )
-    planner = GraphSearch(settings)
+    planner = MctsPlanner(settings)
     planner.set_model(task.model, task.starts[:0])
     planner.set_goal(goal)
     return planner
@@ -130,17 +130,17 @@ def _shares(task: NetworkTask, actions: Sequence[Ints]) -> tuple[float, float, f
 
 def _timed(task: NetworkTask, effort: Effort, n_roots: int, repetitions: int) -> tuple[float, float]:
     """(median seconds per call, mean number of distinct next states sampled in it), with the game's own goal."""
-    roots, seconds, drawn = np.resize(task.roots, (n_roots, task.roots.shape[1])), [], 0.0
+    roots, seconds = np.resize(task.roots, (n_roots, task.roots.shape[1])), []
     planner = planner_for(task, task.goals[0], effort, 0)
     for repetition in range(repetitions + 1):  # the first one includes compilation and memory allocation
-        calls, before = max(1, 16 // n_roots), planner.expanded
+        calls = max(1, 16 // n_roots)
         began = time.process_time()
         for call in range(calls):
             planner.plan(np.roll(roots, call, axis=0) if n_roots > 1 else task.roots[call % len(task.roots)][None])
         if repetition:
             seconds.append((time.process_time() - began) / calls)
-            drawn = (planner.expanded - before) / calls
-    return float(np.median(seconds)), drawn
+    drawn = [planner.trace(root[None]).graph.n_edges for root in task.roots]
+    return float(np.median(seconds)), n_roots * float(np.mean(drawn))
 
 
 def measure_own(task: NetworkTask, effort: Effort, repetitions: int = 5) -> NetworkRow:

@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
 from mbagent.models.tabular import TabularMDP
-from mbagent.planning.planner import PlannerSettings, best_actions
+from mbagent.planning.planner import PlannerSettings
 from mbagent.planning.planners import MctsPlanner
+from mbagent.planning.racing import LookaheadConfig
+from mbagent.planning.value_iteration import LeafValues
 from mbagent.types import Ints
-from studies.planning.machine_search import known_machine, search_machine
 from studies.planning.peers import Speed
 from worlds.random_mdps import RandomMDP
 
@@ -38,52 +39,54 @@ def as_model(world: RandomMDP) -> TabularMDP:
     return TabularMDP(offsets, following, world.ends[following], world.probabilities.reshape(-1), n_actions, nowhere)
 
 
-def with_rollouts(world: RandomMDP) -> TableSearch:
-    """The agent's planner as textbook UCT, with random rollouts instead of the given leaf values."""
-    model, none = as_model(world), np.zeros((0, 1), dtype=np.int64)
+def _planned(world: RandomMDP, start: Ints, leaf: LeafValues | None, **changed: Any) -> TableSearch:
+    """Decisions of the MctsPolicy's planner that knows the rules, with changed settings and values of unexpanded states."""
+    model, planners = as_model(world), dict[tuple[int, int], MctsPlanner]()
 
     def search(roots: Ints, n_simulations: int, seed: int) -> tuple[Ints, int]:
-        settings = PlannerSettings(
-            num_simulations=n_simulations, gamma=world.gamma, leaf_values="rollouts", backup="mean", seed=seed
-        )
-        planner = MctsPlanner(settings)
-        planner.set_model(model, none)
-        planner.set_goal(lambda states, actions, next_states: world.rewards[next_states[:, 0]])
+        planner = planners.get((n_simulations, seed))
+        if planner is None:
+            settings = PlannerSettings(num_simulations=n_simulations, gamma=world.gamma, seed=seed, **changed)
+            planner = planners[n_simulations, seed] = MctsPlanner(settings)
+            planner.set_model(model, start[:, None])
+            planner.set_goal(lambda states, actions, next_states: world.rewards[next_states[:, 0]])
+            if leaf is not None:
+                planner.config = LookaheadConfig(leaf, settings.lookahead_states, settings.lookahead_samples)
         return planner.plan(roots[:, None]).actions, len(roots) * n_simulations
 
     return search
 
 
-def on_machine(world: RandomMDP) -> TableSearch:
-    """Tree search on the MDP as a known reachable MDP."""
-    model = as_model(world)
-    following, over = model.next_states, model.terminated
-    mdp = known_machine(
-        model.offsets,
-        following,
-        model.probabilities,
-        world.rewards[following],
-        over,
-        world.leaf_values,
-        model.n_actions,
-        world.gamma,
-    )
-
-    def search(roots: Ints, n_simulations: int, seed: int) -> tuple[Ints, int]:
-        found = search_machine(mdp, roots, n_simulations, seed)
-        return best_actions(found.values), found.steps
-
-    return search
+def solved(world: RandomMDP) -> TableSearch:
+    """The default: the reachable MDP is solved once for the goal, so a decision needs no simulation."""
+    return _planned(world, np.flatnonzero(~world.ends), None)
 
 
-OWN_SEARCHES: dict[str, Prepare] = {"mbagent": on_machine, "mbagent, random play at leaves": with_rollouts}
+def searched(world: RandomMDP) -> TableSearch:
+    """The search for MDPs that are too large to solve, with the given leaf values instead of learned ones."""
+    values, value = world.leaf_values, np.arange(-1, len(world.leaf_values) - 1)
+    zero, bound = np.zeros(1, dtype=np.int64), float(np.abs(values).max())
+    leaf = LeafValues(zero, zero, value, float(values[0]), values[1:] - values[0], np.zeros((0, 0)), -bound, bound)
+    return _planned(world, zero[:0], leaf, max_states=1)
+
+
+def with_rollouts(world: RandomMDP) -> TableSearch:
+    """The planner as textbook UCT, with random rollouts instead of the given leaf values."""
+    return _planned(world, np.zeros(0, dtype=np.int64), None, leaf_values="rollouts", backup="mean")
+
+
+OWN_SEARCHES: dict[str, Prepare] = {
+    "mbagent": solved,
+    "mbagent, too large to solve": searched,
+    "mbagent, random play at leaves": with_rollouts,
+}
 """The library's searches in the comparison, by name."""
 
 
 def time_search(search: TableSearch, roots: Ints, speeds: Sequence[tuple[int, int]], repetitions: int = 5) -> list[Speed]:
     """Times a search as the peers' scripts do: processor time on one thread, the median after a first call that may compile.
 
-    A repetition lasts at least a hundredth of a second, with several calls if necessary.
+    A repetition lasts at least a hundredth of a second, with several calls if necessary; each repetition has other roots.
     """
     found = []
     for n_roots, simulations in speeds:
@@ -93,9 +96,10 @@ def time_search(search: TableSearch, roots: Ints, speeds: Sequence[tuple[int, in
         search(some, simulations, 0)
         calls = max(1, math.ceil(0.01 / max(time.process_time() - began, 1e-6)))
         for repetition in range(repetitions):
+            some = np.resize(np.roll(roots, -repetition), n_roots)
             began = time.process_time()
-            for call in range(calls):
-                search(some, simulations, 1 + repetition * calls + call)
+            for _ in range(calls):
+                search(some, simulations, 0)
             seconds.append((time.process_time() - began) / calls)
         median = max(float(np.median(seconds)), 1e-9)
         found.append(Speed(n_roots, simulations, median, n_roots * simulations / median, samples / median))

@@ -37,12 +37,14 @@ NOTES = {
     "includes the work done once per goal.",
     "memory": "Memory of the process after a tenth of the decisions and at the end.",
     "regret": "Random MDPs with 25 states, 4 actions and known exact values; all searches get the same crude leaf values (exact "
-    "values plus noise of the same standard deviation), except those with random rollouts. 1 is the regret of a random action, "
+    "values plus noise of the same standard deviation), except the default of mbagent, which solves the MDP, and those with "
+    "random play at leaves. 1 is the regret of a random action, "
     "0 is perfect; error: standard error over MDPs. The depth in mctx is at most 15 steps.",
-    "speed": "Processor time on one core, the median of several calls. Only ratios within one run are meaningful. A "
-    "simulation of mbagent's search in a known MDP has at most 3 steps, with the MDP's exact probabilities; with random "
-    "rollouts it continues to the horizon; a peer's ends at the leaf of its tree. In Stochastic MuZero, a chance node takes a "
-    "simulation of its own.",
+    "speed": "Processor time of a decision on one core, the median of several calls. Only ratios within one run are meaningful. "
+    "mbagent solves an MDP of this size once for each goal, and then simulates nothing: its simulations per second are only "
+    "those of a search that would take as long. A simulation of its search continues until an unexpanded state or 20 steps, "
+    "with random play at leaves always to the horizon; a peer's ends at the leaf of its tree. In Stochastic MuZero, a chance "
+    "node takes a simulation of its own.",
     "naive": "Microseconds of processor time per state. Naive: a full forward pass of predictor and conditioner in torch for "
     "every variable. bar: the required ratio.",
     "short cut": "Full: all variables are resampled in every sweep; short: only those with predicted probabilities between 2% "

@@ -61,11 +61,12 @@ class RegretRow:
 
 @dataclass(frozen=True)
 class SpeedRow:
-    """Speed of a search: the fields of ``Speed``, and its name."""
+    """Speed of a search: the fields of ``Speed``, in milliseconds, and its name."""
 
     search: str
     roots: int
     simulations: int
+    milliseconds: float
     simulations_per_second: float
     samples_per_second: float
 
@@ -158,4 +159,6 @@ def _peers(
 
 
 def _rows(name: str, speeds: Sequence[Speed]) -> list[SpeedRow]:
-    return [SpeedRow(name, s.roots, s.simulations, s.simulations_per_second, s.samples_per_second) for s in speeds]
+    return [
+        SpeedRow(name, s.roots, s.simulations, 1e3 * s.seconds, s.simulations_per_second, s.samples_per_second) for s in speeds
+    ]
