@@ -23,7 +23,7 @@ class TableSearch(Protocol):
     """A search that is prepared for one MDP."""
 
     def __call__(self, roots: Ints, n_simulations: int, seed: int) -> tuple[Ints, int]:
-        """(actions int64 [R], total number of sampled next states) for roots int64 [R], independent of each other."""
+        """(actions int64 [R], total number of sampled next states, 0 without simulations) for independent roots int64 [R]."""
         ...
 
 
@@ -40,7 +40,10 @@ def as_model(world: RandomMDP) -> TabularMDP:
 
 
 def _planned(world: RandomMDP, start: Ints, leaf: LeafValues | None, **changed: Any) -> TableSearch:
-    """Decisions of the MctsPolicy's planner that knows the rules, with changed settings and values of unexpanded states."""
+    """Decisions of the MctsPolicy's planner that knows the rules, with changed settings and values of unexpanded states.
+
+    Without ``start`` states there is no MDP to solve in advance.
+    """
     model, planners = as_model(world), dict[tuple[int, int], MctsPlanner]()
 
     def search(roots: Ints, n_simulations: int, seed: int) -> tuple[Ints, int]:
@@ -52,7 +55,7 @@ def _planned(world: RandomMDP, start: Ints, leaf: LeafValues | None, **changed: 
             planner.set_goal(lambda states, actions, next_states: world.rewards[next_states[:, 0]])
             if leaf is not None:
                 planner.config = LookaheadConfig(leaf, settings.lookahead_states, settings.lookahead_samples)
-        return planner.plan(roots[:, None]).actions, len(roots) * n_simulations
+        return planner.plan(roots[:, None]).actions, 0 if len(start) else len(roots) * n_simulations
 
     return search
 
@@ -102,5 +105,6 @@ def time_search(search: TableSearch, roots: Ints, speeds: Sequence[tuple[int, in
                 search(some, simulations, 0)
             seconds.append((time.process_time() - began) / calls)
         median = max(float(np.median(seconds)), 1e-9)
-        found.append(Speed(n_roots, simulations, median, n_roots * simulations / median, samples / median))
+        rate = n_roots * simulations / median if samples else float("nan")
+        found.append(Speed(n_roots, simulations, median, rate, samples / median))
     return found
