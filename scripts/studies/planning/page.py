@@ -42,8 +42,8 @@ NOTES = {
     "0 is perfect; error: standard error over MDPs. The depth in mctx is at most 15 steps.",
     "speed": "Processor time of a decision on one core, the median of several calls. Only ratios within one run are meaningful. "
     "mbagent solves an MDP of this size once for each goal, and then simulates nothing. A simulation of its search continues "
-    "until an unexpanded state or 20 steps, with random play at leaves always to the horizon; a peer's ends at the leaf of its tree. In Stochastic MuZero, a chance "
-    "node takes a simulation of its own.",
+    "until an unexpanded state or 20 steps, with random play at leaves always to the horizon; a peer's ends at the leaf of its "
+    "tree. In Stochastic MuZero, a chance node takes a simulation of its own.",
     "naive": "Microseconds of processor time per state. Naive: a full forward pass of predictor and conditioner in torch for "
     "every variable. bar: the required ratio.",
     "short cut": "Full: all variables are resampled in every sweep; short: only those with predicted probabilities between 2% "
