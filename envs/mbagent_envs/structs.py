@@ -12,8 +12,9 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import cache
 from numbers import Integral
-from typing import Any, cast, dataclass_transform
+from typing import Any, ClassVar, cast, dataclass_transform
 
 import numba
 import numpy as np
@@ -130,13 +131,18 @@ def _unbox(kind: Any, thing: Any, c: Any) -> Any:
 
 
 _TYPES: dict[Any, StructType] = {}
-"""All types of structs; equal ones are one object."""
+"""All types of structs by class and identities of the attributes' types; equal types are one object, and stay alive."""
+
+
+@cache
+def _array_type(dtype: Any, ndim: int) -> Any:
+    return types.Array(numba.from_dtype(dtype), ndim, "C")
 
 
 def _member(value: Any) -> tuple[Any, list[int]]:
     """Type of an attribute's value in compiled code, and its words; a type of None if no struct can have it."""
     if isinstance(value, np.ndarray):
-        return types.Array(numba.from_dtype(value.dtype), value.ndim, "C"), [value.ctypes.data, *value.shape]
+        return _array_type(value.dtype, value.ndim), [value.__array_interface__["data"][0], *value.shape]
     if isinstance(value, Struct):
         return value._numba_type_, [value._address]
     if isinstance(value, float):
@@ -160,19 +166,20 @@ class Struct:
         ValueError: an array is not contiguous.
     """
 
+    _names: ClassVar[tuple[str, ...]]
     _address: int
     _words: Any
     _numba_type_: Any
 
     def __init_subclass__(cls) -> None:
         """Makes a dataclass of the subclass."""
-        dataclass(frozen=True, eq=False)(cls)
+        cls._names = tuple(field.name for field in fields(cast("Any", dataclass(frozen=True, eq=False)(cls))))
 
     def __post_init__(self) -> None:
         """Writes the words that compiled code reads."""
         words: list[int] = []
-        members = []
-        for name in type(self)._names():
+        kinds = []
+        for name in self._names:
             value = getattr(self, name)
             kind, its_words = _member(value)
             if kind is None:
@@ -182,17 +189,13 @@ class Struct:
             if isinstance(value, np.ndarray) and not value.flags.c_contiguous:
                 raise ValueError(f"{type(self).__name__}.{name} has to be a contiguous array.")
             words += its_words
-            members.append((name, kind))
-        key = (type(self), tuple(members))
-        made = _TYPES.get(key) or _TYPES.setdefault(key, StructType(*key))
+            kinds.append(kind)
+        key = (type(self), *map(id, kinds))
+        made = _TYPES.get(key) or _TYPES.setdefault(key, StructType(type(self), tuple(zip(self._names, kinds, strict=True))))
         stored = np.asarray(words, dtype=np.uint64)
-        for name, value in (("_words", stored), ("_address", stored.ctypes.data), ("_numba_type_", made)):
+        for name, value in (("_words", stored), ("_address", stored.__array_interface__["data"][0]), ("_numba_type_", made)):
             object.__setattr__(self, name, value)
-
-    @classmethod
-    def _names(cls) -> list[str]:
-        return [field.name for field in fields(cast("Any", cls))]
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies are made of the attributes, since addresses hold only in this process."""
-        return type(self), tuple(getattr(self, name) for name in type(self)._names())
+        return type(self), tuple(getattr(self, name) for name in self._names)
