@@ -107,9 +107,10 @@ class CallableReward:
                 f"The reward function must return one number for each of the {len(actions)} transitions it is given "
                 f"(shape ({len(actions)},)), got shape {rewards.shape}; its arguments are batches: index them as obs[:, ...]."
             )
-        if not np.isfinite(rewards).all():
+        largest = np.abs(rewards).max()
+        if not largest < np.inf:
             raise ValueError("The reward function returned NaN or infinity; every reward must be a finite number.")
-        if np.abs(rewards).max() > LARGEST_REWARD:
+        if largest > LARGEST_REWARD:
             raise ValueError(
                 f"The reward function returned {rewards[np.abs(rewards).argmax()]:g}; since returns are sums of many rewards, "
                 f"none may be larger than {LARGEST_REWARD:g}: scale them down."

@@ -383,15 +383,13 @@ class _Search:
             done += size
 
     def _make_room(self) -> None:
-        """Enlarges the statistics to the size of the graph."""
-        tree, n, m = self.tree, len(self.graph), self.graph.n_edges
-        if len(tree.values.v) < n:
-            visits, counted = _longer(tree.visits, 2 * n), _longer(tree.counted, 2 * n)
-            values = replace(tree.values, v=_longer(tree.values.v, 2 * n), q=_longer(tree.values.q, 2 * n))
-            tree = replace(tree, values=values, visits=visits, counted=counted)
-        if len(tree.values.rewards) < m:
-            tree = replace(tree, values=replace(tree.values, rewards=_longer(tree.values.rewards, 2 * m)))
-        self.tree = tree
+        """Enlarges the statistics to the size of the graph, with spare capacity."""
+        tree, values, n, m = self.tree, self.tree.values, len(self.graph), self.graph.n_edges
+        if len(values.v) >= n and len(values.rewards) >= m:
+            return
+        v, q, visits, counted = (_longer(table, 2 * n) for table in (values.v, values.q, tree.visits, tree.counted))
+        values = replace(values, v=v, q=q, rewards=_longer(values.rewards, 2 * m))
+        self.tree = replace(tree, values=values, visits=visits, counted=counted)
 
     def _roll_out(self, batch: Batch, done: int, size: int) -> None:
         """Evaluates the node at which each of the ``size`` simulations from each root ended by random play."""
@@ -420,7 +418,7 @@ def _key(seed: int, number: int) -> np.uint64:
 
 
 def _longer(table: NDArray[np.float64], size: int) -> Floats:
-    longer = np.empty((size, *table.shape[1:]))
+    longer = np.empty((max(size, len(table)), *table.shape[1:]))
     longer[: len(table)] = table
     return longer
 
