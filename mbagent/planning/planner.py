@@ -39,7 +39,8 @@ class PlannerSettings:
         forecasts: "iterated" (simulations go step by step) or "direct" (flat Monte Carlo only: the state before each step is
             forecast from the root by a separate model, paper 4.2; needs ``model="direct"`` or another DirectForecastModel).
         c_uct: weight of exploration in the search, in units of the range of values.
-        batch_size: simulations between two calls of the model.
+        batch_size: simulations between two calls of the model; later, without rollouts, a quarter of those done if that is more
+            (at most 256).
         prior_visits: number of visits that an initial value counts for in the search.
         reuse_tree: whether a decision continues the search of the previous decision (MctsPolicy, one observation at a time). The
             kept search is dropped at episode starts (see ``predict(..., episode_start=...)``), with a new goal or new weights,

@@ -328,7 +328,9 @@ class _Search:
         prior = 0.0 if rollouts else settings.prior_visits
         # A reused tree must not see the random numbers that it was built with.
         key = derive(settings.seed, _REUSE_SALT, decision)[0] if decision else _key(settings.seed, 0)
-        self.rules = SearchRules(settings.gamma, float(settings.c_uct), float(prior), rollouts, settings.backup == "mean", key)
+        self.rules = SearchRules(
+            settings.gamma, float(settings.c_uct), float(prior), rollouts, settings.batch_size, settings.backup == "mean", key
+        )
         if not (rollouts and decision):
             measure_spans(graph.arrays, tree)
 
@@ -336,14 +338,15 @@ class _Search:
         """Runs all simulations; with ``deadline``, as many as fit before that value of ``time.perf_counter``."""
         if deadline is not None:
             return self._run_until(deadline)
-        total = self.settings.num_simulations
-        self._run(empty_batch(len(self.tree.roots), min(self.settings.batch_size, total), self.settings.horizon), 0, total)
+        settings, n_roots, total = self.settings, len(self.tree.roots), self.settings.num_simulations
+        most = min(settings.batch_size, total) if self.rules.rollouts else total  # no larger batches of random returns
+        self._run(empty_batch(n_roots, settings.batch_size, most, settings.horizon), 0, total)
         return self._result()
 
     def _run_until(self, deadline: float) -> Expanded:
         """Runs a batch, then more while one more batch and the final value iteration should end before the deadline."""
         size, done, now = self.settings.batch_size, 0, time.perf_counter()
-        batch = empty_batch(len(self.tree.roots), size, self.settings.horizon)
+        batch = empty_batch(len(self.tree.roots), size, size, self.settings.horizon)
         last = 0.0
         while done == 0 or (now + last + self.planner.settling * len(self.graph) < deadline and len(self.graph) < MAX_SEARCHED):
             began = now

@@ -19,6 +19,9 @@ from mbagent_envs.jit import compiled, inlined
 from mbagent_envs.random_keys import uniform_at
 from mbagent_envs.structs import Struct
 
+BATCH_SHARE, LARGEST_BATCH = 4, 256
+"""A batch may have a BATCH_SHARE-th of the simulations done before, at most LARGEST_BATCH: it does not see its own values."""
+
 WIDENING_SWEEPS = 3
 """Number of sweeps of value iteration after a batch that widened the graph."""
 
@@ -31,6 +34,7 @@ class SearchRules(Struct):
         c_uct: weight of exploration.
         prior_visits: number of visits that an initial value counts for.
         rollouts: whether leaves are evaluated by random play.
+        batch_size: number of simulations of the first batches.
         mean: True to back up means of returns, False for Bellman backups.
         key: of the random numbers, uint64.
     """
@@ -39,6 +43,7 @@ class SearchRules(Struct):
     c_uct: float
     prior_visits: float
     rollouts: bool
+    batch_size: int
     mean: bool
     key: np.uint64
 
@@ -89,9 +94,10 @@ class Batch(Struct):
     allowance: Ints
 
 
-def empty_batch(n_roots: int, batch_size: int, horizon: int) -> Batch:
-    """Arrays for the paths of one batch."""
-    shape, size = (n_roots, batch_size), n_roots * batch_size
+def empty_batch(n_roots: int, batch_size: int, total: int, horizon: int) -> Batch:
+    """Arrays for the paths of any batch, of at least ``batch_size`` of ``total`` simulations from each root."""
+    most = min(total, max(batch_size, min(total // BATCH_SHARE, LARGEST_BATCH)))
+    shape, size = (n_roots, most), n_roots * most
     edges, ints = np.zeros((*shape, horizon), dtype=np.int64), np.zeros((5, size), dtype=np.int64)
     lengths, leaves, ends = (row.reshape(shape) for row in ints[:3])
     return Batch(edges, lengths, leaves, ends, np.zeros(shape), ints[3], ints[4], np.zeros(n_roots, dtype=np.int64))
@@ -110,7 +116,7 @@ def advance(
         and of nodes to expand by widening.
     """
     while done < total:
-        size = min(batch.lengths.shape[1], total - done)
+        size = min(max(rules.batch_size, done // BATCH_SHARE), batch.lengths.shape[1], total - done)
         simulate(graph, tree, rules, batch, done, size)
         n_reached, n_widened = _nodes_to_expand(graph, tree, rules, batch, size)
         if n_reached > 0 or n_widened > 0 or rules.rollouts:
