@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[1]
 SOURCES = sorted(p for folder in ("mbagent", "envs", "scripts", "tests") for p in (ROOT / folder).rglob("*.py"))
 MAX_FILE_LINES = 600
 MAX_FUNCTION_LINES = 60
+MAX_ARGUMENTS = 8
 MEDIAN_FILE_LINES, MEDIAN_FUNCTION_LINES = 200, 10
 MOST_LIBRARY_FILES, MOST_FILES_IN_A_FOLDER = 90, 20
 LIBRARY = [p for p in SOURCES if p.relative_to(ROOT).parts[0] == "mbagent"]
@@ -82,6 +83,24 @@ def test_files_and_functions_stay_short(path: Path) -> None:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and lines_without_docstring(node) > MAX_FUNCTION_LINES
     }
     assert not too_long
+
+
+def n_arguments(function: ast.FunctionDef) -> int:
+    """Number of arguments, without ``self`` or ``cls``."""
+    names = [argument.arg for argument in (*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs)]
+    return len(names) - int(names[:1] in (["self"], ["cls"]))
+
+
+def test_functions_have_few_arguments() -> None:
+    """But for constructors."""
+    functions = (
+        (f"{path.relative_to(ROOT)}: {node.name}", n_arguments(node))
+        for path in SOURCES
+        if path.relative_to(ROOT).parts[0] in ("mbagent", "envs")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.FunctionDef) and node.name != "__init__"
+    )
+    assert not {name: n for name, n in functions if n > MAX_ARGUMENTS}
 
 
 @pytest.mark.parametrize(
