@@ -72,16 +72,24 @@ class CallableReward:
         if not callable(fn):
             raise TypeError(f"A reward must be a function of (obs, action, next_obs), got {fn!r}.")
         _check_signature(fn)
-        self.fn, self._space, self._actions = fn, space, actions
+        self.fn, self._space = fn, space
+        self._every_action: NDArray[Any] = actions.decode_wide(np.arange(actions.n))
 
     def __call__(self, states: States, actions: Actions, next_states: States) -> Floats:
         """Rewards float64 [M]; see ``types.Reward``."""
+        return self._rewards(states, actions, next_states, copy=True)
+
+    def of_owned(self, states: States, actions: Actions, next_states: States) -> Floats:
+        """As a call, for arrays of states that may be modified, which need not be copied for the reward function."""
+        return self._rewards(states, actions, next_states, copy=False)
+
+    def _rewards(self, states: States, actions: Actions, next_states: States, copy: bool) -> Floats:
         if len(actions) == 0:
             return np.zeros(0)
         batch = (
-            self._space.decode_wide(states),
-            self._actions.decode_wide(actions),
-            self._space.decode_wide(next_states),
+            self._space.decode_wide(states, copy),
+            self._every_action.take(actions, axis=0),
+            self._space.decode_wide(next_states, copy),
         )
         try:
             result = self.fn(*batch)

@@ -314,16 +314,19 @@ class FactoredSpace:
         """The batch that ``factors`` [B, F] encode, in the form of ``batch_space`` and the space's own data types."""
         return self._decode(factors, integers=False)
 
-    def decode_wide(self, factors: NDArray[Any]) -> Any:
-        """Like ``decode``, but all integers are int64 (for reward functions, since int8 sums can overflow)."""
-        return self._decode(factors, integers=True)
+    def decode_wide(self, factors: NDArray[Any], copy: bool = True) -> Any:
+        """Like ``decode``, but all integers are int64 (for reward functions, since int8 sums can overflow).
 
-    def _decode(self, factors: NDArray[Any], integers: bool) -> Any:
+        Without ``copy``, the result may contain ``factors``, which are modified.
+        """
+        return self._decode(factors, integers=True, copy=copy)
+
+    def _decode(self, factors: NDArray[Any], integers: bool, copy: bool = True) -> Any:
         parts: dict[tuple[str | int, ...], NDArray[Any]] = {}
         start, numbers = 0, self.widen(factors)
         for leaf in self._leaves:
             stop = start + len(leaf.cardinalities)
-            parts[leaf.path] = leaf.decode(numbers[:, start:stop].astype(np.int64), integers)  # a copy, which may be modified
+            parts[leaf.path] = leaf.decode(numbers[:, start:stop].astype(np.int64, copy=copy), integers)
             start = stop
         return assemble(self.space, parts)
 

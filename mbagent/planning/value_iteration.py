@@ -125,7 +125,8 @@ def score_edges(graph: StateGraph, goal: Reward, start: int = 0) -> Floats:
         return np.zeros(0)
     sources, next_nodes = graph.sources[start:], graph.next_nodes[start:]
     states = graph.states  # take is three times as fast as indexing of rows
-    return goal(states.take(sources, axis=0), graph.actions[start:], states.take(next_nodes, axis=0))
+    score: Reward = getattr(goal, "of_owned", goal)
+    return score(states.take(sources, axis=0), graph.actions[start:], states.take(next_nodes, axis=0))
 
 
 def solve(graph: StateGraph, goal: Reward, gamma: float, n_groups: int = 1, leaf: LeafValues = LOWEST_KNOWN) -> Values:
