@@ -120,7 +120,7 @@ def write(target: Target, state: AgentState) -> None:
         archive.writestr("data", json.dumps({"format": FORMAT, **state.data}, indent=1))
         for name, group in state.arrays.items():
             part = io.BytesIO()
-            np.savez(part, allow_pickle=False, **group)
+            files.write_arrays(part, group)
             archive.writestr(f"{name}.npz", part.getvalue())
         archive.writestr("_stable_baselines3_version", stable_baselines3.__version__)
         archive.writestr("system_info.txt", f"- Gymnasium: {gym.__version__}\n- Numpy: {np.__version__}\n")

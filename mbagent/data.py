@@ -247,13 +247,9 @@ class TransitionDataset:
         """
         rows = self.rows()
         with files.writing(path, ".npz", always=True) as file:
-            np.savez_compressed(
-                file,
-                cardinalities=np.array(self.cardinalities),
-                n_actions=np.array(self.n_actions),
-                allow_pickle=False,
-                **{name: getattr(rows, kept) for name, kept in zip(_COLUMNS, _KEPT, strict=True)},
-            )
+            columns = {name: getattr(rows, kept) for name, kept in zip(_COLUMNS, _KEPT, strict=True)}
+            sizes = {"cardinalities": np.array(self.cardinalities), "n_actions": np.array(self.n_actions)}
+            files.write_arrays(file, {**sizes, **columns}, compressed=True)
 
     @classmethod
     def load(cls, path: files.Target) -> TransitionDataset:

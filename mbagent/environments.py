@@ -88,6 +88,8 @@ class Guarded(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
         names = "(observation, reward, terminated, truncated, info)"
         obs, reward, terminated, truncated, info = self._checked_tuple(self.env.step(action), "step", names, 5)
         try:
+            if np.ndim(reward):
+                raise TypeError("an array")
             float(reward)
         except (TypeError, ValueError) as error:
             raise TypeError(

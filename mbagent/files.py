@@ -18,7 +18,7 @@ import sys
 import uuid
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, TypeGuard
@@ -91,6 +91,19 @@ def arrays(file: BinaryIO) -> dict[str, NDArray[Any]]:
             return {name: np.asarray(archive[name]) for name in archive.files}
     except (ValueError, EOFError, TypeError, AttributeError, KeyError, zipfile.BadZipFile, zlib.error):
         raise ValueError("it is not an .npz of plain arrays, or is damaged") from None
+
+
+def write_arrays(file: BinaryIO | Path, given: Mapping[str, NDArray[Any]], compressed: bool = False) -> None:
+    """Writes an ``.npz``.
+
+    Raises:
+        TypeError: an array contains Python objects, which NumPy would pickle.
+    """
+    for name, array in given.items():
+        if np.asarray(array).dtype.hasobject:
+            raise TypeError(f"The array {name!r} contains Python objects, which cannot be saved.")
+    save: Any = np.savez_compressed if compressed else np.savez
+    save(file, **given)  # without allow_pickle, which older versions of NumPy do not know
 
 
 def _is_open(target: Any, method: str) -> TypeGuard[BinaryIO]:

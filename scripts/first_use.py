@@ -39,7 +39,9 @@ IMPORT = "import time; began = time.process_time(); import {name}; print(time.pr
 
 def seconds(code: str, folder: Path) -> float:
     """What a program prints last, run in a new process with one thread and a folder for compiled functions and bytecode."""
-    folders = {"NUMBA_CACHE_DIR": str(folder), "PYTHONPYCACHEPREFIX": str(folder), "PYTHONDONTWRITEBYTECODE": ""}
+    compiled, bytecode = folder / "compiled", folder / "bytecode"
+    compiled.mkdir(exist_ok=True)
+    folders = {"NUMBA_CACHE_DIR": str(compiled), "PYTHONPYCACHEPREFIX": str(bytecode), "PYTHONDONTWRITEBYTECODE": ""}
     settings = {**os.environ, **folders, "OMP_NUM_THREADS": "1"}
     done = subprocess.run([sys.executable, "-c", code], env=settings, cwd=folder, capture_output=True, text=True, check=True)
     return float(done.stdout.split()[-1])

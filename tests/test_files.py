@@ -326,3 +326,9 @@ def test_files_that_are_no_table_raise_an_error_without_advice_to_read_pickles(t
             TransitionDataset.load(path)
         assert path.name in str(caught.value)
         assert "allow_pickle" not in str(caught.value)
+
+
+def test_arrays_of_objects_are_not_saved_as_pickles(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="'bad' contains Python objects"):
+        files.write_arrays(tmp_path / "arrays.npz", {"good": np.zeros(1), "bad": np.array([None])})
+    assert not list(tmp_path.iterdir())

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from exact import optimal_q
+from mbagent import files
 from mbagent.types import Bools, Floats, Ints
 
 Kind: TypeAlias = Literal["dense", "sparse"]
@@ -116,4 +117,4 @@ def save_mdp(path: Path, world: RandomMDP, **further: NDArray[np.generic]) -> No
     """Writes an MDP and further arrays as .npz, in the format read by the scripts in ``scripts/peers``."""
     names = ("successors", "probabilities", "rewards", "ends", "leaf_values", "gamma")
     arrays = {name: np.asarray(getattr(world, name)) for name in names}
-    np.savez(path, allow_pickle=False, **arrays, **further)
+    files.write_arrays(path, {**arrays, **further})

@@ -19,6 +19,9 @@ from mbagent.adapters.minigrid import make_minigrid
 from mbagent.adapters.rddl import RddlEnv
 from worlds import toy_mdps  # noqa: F401 - registers
 
+TAXI = "Taxi-v4" if "Taxi-v4" in gym.registry else "Taxi-v3"
+"""Newest version that is installed."""
+
 
 @dataclass(frozen=True)
 class World:
@@ -75,7 +78,7 @@ WORLDS = (
     World("FrozenLake 4x4", "toy_text", "FrozenLake-v1", {"map_name": "4x4"}),
     World("FrozenLake 8x8", "toy_text", "FrozenLake-v1", {"map_name": "8x8"}, steps=50_000),
     World("CliffWalking", "toy_text", "CliffWalking-v1", {"max_episode_steps": 200}),
-    World("Taxi", "toy_text", "Taxi-v4"),
+    World("Taxi", "toy_text", TAXI),
     World("SysAdmin", "rddl", "SysAdmin_MDP_ippc2011"),
     World("GameOfLife", "rddl", "GameOfLife_MDP_ippc2011"),
     World("Navigation", "rddl", "Navigation_MDP_ippc2011"),

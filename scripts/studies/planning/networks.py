@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from exact import optimal_q
+from mbagent import files
 from mbagent.data import TransitionBatch, TransitionDataset
 from mbagent.models.neural.export import pack_dense, pack_groups
 from mbagent.models.neural.model import NeuralTransitionModel
@@ -207,7 +208,7 @@ def run_networks_in_mctx(python: Path, task: NetworkTask, repetitions: int = 5) 
     with TemporaryDirectory() as folder:
         path = Path(folder) / "networks.npz"
         query = {"speeds": speeds, "repetitions": np.asarray(repetitions), "budgets": np.array(BUDGETS), "seeds": np.array(SEEDS)}
-        np.savez(path, allow_pickle=False, **exported(task), **query)
+        files.write_arrays(path, {**exported(task), **query})
         output = run_script(python, "mctx_networks", [str(path)])
     choices = {int(n): np.array(actions, dtype=np.int64) for n, actions in output["choices"].items()}
     return PeerOnNetworks([Speed(**speed) for speed in output["speeds"]], choices, np.array(output["mean_next_state"]))

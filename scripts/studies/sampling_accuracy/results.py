@@ -38,7 +38,7 @@ def first_points(results: Sequence[Result[Cell]]) -> Points:
 def save_points(path: Path, points: Points) -> None:
     """Writes points as ``.npz``."""
     with files.replaced(path) as file:
-        np.savez_compressed(file, allow_pickle=False, **{"|".join(key): value for key, value in points.items()})
+        files.write_arrays(file, {"|".join(key): value for key, value in points.items()}, compressed=True)
 
 
 def load_points(path: Path) -> Points:
