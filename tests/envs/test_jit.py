@@ -62,6 +62,16 @@ def test_a_writable_folder_for_numba_is_used_without_a_warning(installed: Path, 
     assert list(tmp_path.rglob("*.nbi"))
 
 
+def test_two_processes_share_an_empty_folder(tmp_path: Path) -> None:
+    code = "from mbagent_envs.random_keys import derive, uniforms; print(uniforms(derive(3, range(4)), 2).sum())"
+    settings = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    started = [subprocess.Popen([sys.executable, "-c", code], env=settings, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    outputs = {process.communicate()[0] for process in started}
+    assert [process.returncode for process in started] == [0, 0]
+    assert len(outputs) == 1
+    assert list(tmp_path.rglob("*.nbi"))
+
+
 @pytest.fixture
 def double(tmp_path: Path) -> Iterator[Callable[[Any], Any]]:
     """A compiled function in a separate folder."""
