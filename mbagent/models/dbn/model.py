@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -207,7 +208,8 @@ class DecisionGraphModel(GraphPredictions):
 
     def _since(self, rows: TransitionBatch, resets: Bools) -> NDArray[np.int64]:
         """First row from which the present rules of each factor and of ``terminated`` hold, int64 [F + 1]."""
-        usual, before = np.flatnonzero(~resets), self._snapshot()
+        usual, without_resets = np.flatnonzero(~resets), copy(self)
+        without_resets._with_resets = False
         groups = find_groups(self.cardinalities, rows.states, rows.next_states, ~resets)
         variable = np.arange(len(self.cardinalities) + 1)
         for group in groups:
@@ -216,14 +218,11 @@ class DecisionGraphModel(GraphPredictions):
         grouped = np.isin(np.arange(len(self.cardinalities)), [f for group in groups for f in group])
 
         def log_predictive(train: TransitionBatch, tests: TransitionBatch) -> Floats:
-            logs = self._factor_log_probs(train, tests)
+            logs = without_resets._factor_log_probs(train, tests)
             logs[:, :-1][grouped & (tests.next_states == 0)] = 0.0  # only the bit that is on counts for a group
             return np.stack([logs[:, variable == v].sum(axis=1) for v in range(variable.max() + 1)], axis=1)
 
-        self._with_resets, with_resets = False, self._with_resets
         since = last_changes(rows.select(usual), variable.max() + 1, log_predictive)
-        self._restore(before)
-        self._with_resets = with_resets
         return np.where(since > 0, usual[since], 0)[variable]
 
     def _split(
@@ -241,16 +240,14 @@ class DecisionGraphModel(GraphPredictions):
 
     def _factor_log_probs(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
         """Log-probabilities [T, F + 1] of the next factors and ``terminated`` in ``tests``, after a quick fit to ``train``."""
-        before = self._snapshot()
-        self._fit_quickly(train)
-        probs, start = self.marginals(tests.states, tests.actions), np.concatenate([[0], np.cumsum(self.cardinalities)])
+        quick = self._quickly_fitted(train)
+        probs, start = quick.marginals(tests.states, tests.actions), np.concatenate([[0], np.cumsum(self.cardinalities)])
         chosen = np.take_along_axis(probs, start[:-1] + tests.after, axis=1)
         ends = [
-            self.log_prob(tests.states, tests.actions, tests.next_states, np.full(len(tests), over)) for over in (False, True)
+            quick.log_prob(tests.states, tests.actions, tests.next_states, np.full(len(tests), over)) for over in (False, True)
         ]
         ends = [np.maximum(logs, -1e3) for logs in ends]  # an impossible state is no evidence about the end
         over = np.where(tests.terminated, ends[1], ends[0]) - np.logaddexp(*ends)
-        self._restore(before)
         return np.concatenate([np.log(chosen.clip(1e-9)), over.clip(-20.0)[:, None]], axis=1)
 
     def _described(self, held_out: TransitionBatch) -> tuple[tuple[VariableReport, ...], float | None]:
@@ -283,23 +280,20 @@ class DecisionGraphModel(GraphPredictions):
         return DecisionGraphModel(space.cardinalities, self.n_actions, parts=self.parts)
 
     def _quick_log_probs(self, train: TransitionBatch, tests: TransitionBatch) -> Floats:
-        """Log-probabilities of ``tests`` after a quick fit to ``train``; the previous fit is restored afterwards."""
-        before = self._snapshot()
-        self._fit_quickly(train)
-        logs = self.log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
-        self._restore(before)
+        """Log-probabilities of ``tests`` after a quick fit to ``train``."""
+        logs = self._quickly_fitted(train).log_prob(tests.states, tests.actions, tests.next_states, tests.terminated)
         return np.maximum(logs, IMPOSSIBLE_LOG_PROB)
 
-    def _fit_quickly(self, rows: TransitionBatch) -> None:
-        """Fits without synchronic arcs."""
+    def _quickly_fitted(self, rows: TransitionBatch) -> Self:
+        """A copy of this model that is fitted to other rows, without synchronic arcs."""
         resets = all_redrawn(flag_resets(rows.before, rows.after) & self._with_resets, len(self.cardinalities))
-        self.fitted = fit_graphs(self.cardinalities, self.encoding, rows, resets, True, False)
+        return self._with(fit_graphs(self.cardinalities, self.encoding, rows, resets, True, False))
 
-    def _snapshot(self) -> Any:
-        return self.fitted
-
-    def _restore(self, snapshot: Any) -> None:
-        self.fitted = snapshot
+    def _with(self, fitted: Fitted) -> Self:
+        """A copy of this model with other graphs."""
+        other = copy(self)
+        other.fitted = fitted
+        return other
 
     def _compare_synchronic(self, held_out: TransitionBatch) -> tuple[float, bool]:
         """Held-out log-likelihood of the better variant, and whether that is the one with synchronic arcs."""
@@ -368,9 +362,9 @@ class DecisionGraphModel(GraphPredictions):
     ) -> Floats:
         """Log-probability [N, K] of the held-out next values of the K factors, each under its given effect."""
         flagged = all_redrawn(resets, len(self.cardinalities))
-        self.fitted = fit_graphs(self.cardinalities, self.encoding, train, flagged, False, False, effect_models)
+        fitted = self._with(fit_graphs(self.cardinalities, self.encoding, train, flagged, False, False, effect_models))
         start = np.concatenate([[0], np.cumsum(self.cardinalities)]).astype(np.int64)
-        probs, factors = self.marginals(held_out.states, held_out.actions), list(effect_models)
+        probs, factors = fitted.marginals(held_out.states, held_out.actions), list(effect_models)
         chosen = np.take_along_axis(probs, start[factors] + held_out.after[:, factors], axis=1)
         logs: Floats = np.log(chosen.clip(1e-9))
         return logs
@@ -381,9 +375,8 @@ class DecisionGraphModel(GraphPredictions):
 
     def _logs(self, fitted: Fitted, rows: TransitionBatch) -> Floats:
         """Log-probability of each transition [N]; impossible ones count as ``IMPOSSIBLE_LOG_PROB``."""
-        before, self.fitted = self.fitted, fitted
-        parts = [self.log_prob(p.states, p.actions, p.next_states, p.terminated) for p in rows.parts(ROWS_AT_ONCE)]
-        self.fitted = before
+        model = self._with(fitted)
+        parts = [model.log_prob(p.states, p.actions, p.next_states, p.terminated) for p in rows.parts(ROWS_AT_ONCE)]
         logs: Floats = np.maximum(np.concatenate([np.zeros(0), *parts]), IMPOSSIBLE_LOG_PROB)
         return logs
 

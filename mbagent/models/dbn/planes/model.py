@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from gymnasium import spaces
@@ -318,15 +319,11 @@ class LocalGraphModel(DecisionGraphModel):
         cells = self.board.to_planes(each[:, :-1]).sum(axis=(2, 3))
         return np.concatenate([cells, each[:, -1:]], axis=1)
 
-    def _fit_quickly(self, rows: TransitionBatch) -> None:
-        """Fits without synchronic arcs or pairwise splits."""
-        self._learn(rows, jointly=False, in_pairs=False)
-
-    def _snapshot(self) -> Any:
-        return self.local, self.fitted, self.reach
-
-    def _restore(self, snapshot: Any) -> None:
-        self.local, self.fitted, self.reach = snapshot
+    def _quickly_fitted(self, rows: TransitionBatch) -> Self:
+        """See the base class; also without pairwise splits."""
+        other = copy(self)
+        other._learn(rows, jointly=False, in_pairs=False)
+        return other
 
     def _best_reach(self, train: TransitionBatch, held_out: TransitionBatch) -> Reach:
         """The smallest reach beyond which held-out likelihood stops improving, judged on a sample of rows."""
@@ -346,8 +343,9 @@ class LocalGraphModel(DecisionGraphModel):
 
     def _reach_log_probs(self, reach: Reach, train: TransitionBatch, tests: TransitionBatch) -> Floats:
         """Log-probabilities of ``tests`` after a quick fit to ``train`` with the given reach."""
-        self._clear(self.local.cardinalities, reach)
-        return self._quick_log_probs(train, tests)
+        other = copy(self)
+        other._clear(self.local.cardinalities, reach)
+        return other._quick_log_probs(train, tests)
 
     def _learn(self, rows: TransitionBatch, jointly: bool = True, since: Ints | None = None, in_pairs: bool = True) -> None:
         """Fits the graphs of all channels, then finds mutex groups and, if ``jointly``, synchronic arcs."""
