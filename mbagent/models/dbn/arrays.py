@@ -280,34 +280,45 @@ def has_graphs(graphs: Graphs, pair: int) -> bool:
     return bool(graphs.entries[pair + 1] > graphs.entries[pair])
 
 
+@inlined
+def leaf_of(node: int, graphs: Graphs, on: Bools) -> int:
+    """The leaf that a row with the features ``on`` [D] reaches from a node."""
+    while graphs.node[node, 0] >= 0:  # without a branch, which the processor could not predict
+        node = graphs.node[node, 1 + np.int64(on[graphs.node[node, 0]])]
+    return node
+
+
 @compiled
 def distributions(
     variables: Ints, state: Ints, action: int, layout: Layout, graphs: Graphs, on: Bools, values: Ints, out: Floats
 ) -> None:
     """Writes some variables' values to ``values`` [U], their next distributions to ``out`` from ``start[variable]`` on."""
     noise, action_class = graphs.noise[0], layout.encoding.action_class[action]
+    usual = graphs.still[0] if graphs.still[0] >= noise else 0.0
     for variable in variables:
         n, start, value = layout.outputs[variable], graphs.start[variable], read(state, variable, layout)
         values[variable] = value
         pair = graphs.pairs[variable] + action_class * n + value
+        begin, end = graphs.entries[pair], graphs.entries[pair + 1]
+        if n <= 2:  # only the value 1 has a graph
+            one = 0.0 if begin < end else usual if value == 0 else 1.0 - usual
+            for e in range(begin, end):
+                if graphs.entry[e, 0] == 1:
+                    leaf = leaf_of(graphs.entry[e, 1], graphs, on)
+                    one = without_noise(graphs.leaf[leaf, 0], graphs.leaf[leaf, 1], n, noise)
+            out[start], out[start + 1] = 1.0 - one, one
+            continue
         total, slack, tested = 0.0, 0.0, False
         for k in range(start, start + n):
             out[k] = 0.0
-        for e in range(graphs.entries[pair], graphs.entries[pair + 1]):
-            node = graphs.entry[e, 1]
-            tested |= graphs.node[node, 0] >= 0
-            while graphs.node[node, 0] >= 0:  # without a branch, which the processor could not predict
-                node = graphs.node[node, 1 + np.int64(on[graphs.node[node, 0]])]
-            rate = without_noise(graphs.leaf[node, 0], graphs.leaf[node, 1], n, noise)
+        for e in range(begin, end):
+            tested |= graphs.node[graphs.entry[e, 1], 0] >= 0
+            leaf = leaf_of(graphs.entry[e, 1], graphs, on)
+            rate = without_noise(graphs.leaf[leaf, 0], graphs.leaf[leaf, 1], n, noise)
             out[start + graphs.entry[e, 0]] = rate
             total += abs(rate)
-            slack += 3.0 * graphs.leaf[node, 1]
-        if n > 2:
-            with_rest(out, graphs, variable, pair, value, total, slack, tested)
-            continue
-        usual = graphs.still[0] if graphs.still[0] >= noise else 0.0
-        rate = out[start + 1] if has_graphs(graphs, pair) else usual if value == 0 else 1.0 - usual
-        out[start], out[start + 1] = 1.0 - rate, rate
+            slack += 3.0 * graphs.leaf[leaf, 1]
+        with_rest(out, graphs, variable, pair, value, total, slack, tested)
 
 
 SAVED: dict[str, tuple[str, int | None]] = {

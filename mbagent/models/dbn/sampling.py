@@ -14,7 +14,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from mbagent.models.dbn.arrays import Graphs, distributions, n_features, ranges, show, show_next, show_next_adjacencies, write
+from mbagent.models.dbn.arrays import (
+    Graphs,
+    distributions,
+    leaf_of,
+    n_features,
+    ranges,
+    show,
+    show_next,
+    show_next_adjacencies,
+    write,
+)
 from mbagent.models.dbn.features import Layout, variable_values
 from mbagent.models.dbn.mutex import mutex_bits, mutex_chances, mutex_distribution, settle, widest
 from mbagent.models.systematic_sampling import NEGLIGIBLE
@@ -151,10 +161,7 @@ def needs_synchronic(variable: int, action: int, w: Work) -> bool:
         return True
     pair = graphs.pairs[variable] + w.layout.encoding.action_class[action] * n + w.values[variable]
     for e in range(graphs.entries[pair], graphs.entries[pair + 1]):
-        node = graphs.entry[e, 1]
-        while graphs.node[node, 0] >= 0:
-            node = graphs.node[node, 1 + np.int64(w.on[graphs.node[node, 0]])]
-        if graphs.leaf[node, 1] > 0.0:
+        if graphs.leaf[leaf_of(graphs.entry[e, 1], graphs, w.on), 1] > 0.0:
             return True
     return False
 
