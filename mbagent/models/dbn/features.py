@@ -205,15 +205,23 @@ def is_lone_bit(layout: Layout) -> Bools:
     return result
 
 
+ROWS_OF_VALUES = 1 << 16
+"""Number of rows whose values are copied at once; bounds the memory."""
+
+
 def variable_values(layout: Layout, states: Factors) -> Factors:
     """Values [B, U - 2] of all variables but the last two in states [B, F], in the smallest dtype.
 
     A group's value is the index of its first bit that is on.
     """
     values = np.empty((len(states), len(layout.outputs) - 2), dtype=np.min_scalar_type(int(layout.outputs.max()) - 1))
-    for variable in range(values.shape[1]):
-        members = layout.members[layout.first[variable] : layout.first[variable + 1]]
-        values[:, variable] = states[:, members[0]] if len(members) == 1 else states[:, members].argmax(axis=1)
+    sizes = np.diff(layout.first)[: values.shape[1]]
+    single, groups = np.flatnonzero(sizes == 1), np.flatnonzero(sizes > 1)
+    for begin in range(0, len(states), ROWS_OF_VALUES):
+        rows = slice(begin, begin + ROWS_OF_VALUES)
+        values[rows, single] = states[rows, layout.members[layout.first[single]]]
+        for group in groups:
+            values[rows, group] = states[rows, layout.members[layout.first[group] : layout.first[group + 1]]].argmax(axis=1)
     return values
 
 

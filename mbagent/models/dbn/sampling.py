@@ -212,7 +212,7 @@ def log_prob(states: Ints, actions: Ints, following: Ints, terminated: Bools, w:
                 on = following[rows][:, bits] == 1
                 which = np.where(on.any(axis=1), on.argmax(axis=1), len(bits))
                 result[rows] += np.where(on.sum(axis=1) < 2, np.log(joint[np.arange(len(joint)), which]), -np.inf)
-        now = variable_values(layout, states[rows])
+        now = variable_values(layout, states[rows]) if len(groups) else values
         for group in groups:  # in a group, exactly the bit of its value is on, or it did not change
             bits = layout.members[layout.first[group] : layout.first[group + 1]]
             one_hot = np.arange(len(bits)) == values[:, group, None]
