@@ -16,14 +16,11 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.core import cgutils, types
 from numba.core.caching import FunctionCache
-from numba.extending import intrinsic
 
 from mbagent_envs.callees import link_callees
 
 _F = TypeVar("_F", bound=Callable[..., Any])
-_T = TypeVar("_T")
 
 
 def compiled(function: _F) -> _F:
@@ -115,35 +112,3 @@ def _sources(folder: Path) -> str:
 def inlined(function: _F) -> _F:
     """Compile a function inline into every compiled function that calls it; for small functions that are called often."""
     return cast("_F", numba.njit(inline="always")(function))
-
-
-def _without_owner(context: Any, builder: Any, kind: Any, value: Any) -> Any:
-    """Code for arrays, or the arrays in a tuple, without a reference to their owners."""
-    if isinstance(kind, types.Array):
-        view = context.make_array(kind)(context, builder, value)
-        null: Any = cgutils.get_null_value
-        view.meminfo, view.parent = null(view.meminfo.type), null(view.parent.type)
-        return view._getvalue()
-    if isinstance(kind, types.BaseTuple):
-        for i, part in enumerate(cast("Any", kind).types):
-            old = builder.extract_value(value, i)
-            value = builder.insert_value(value, _without_owner(context, builder, part, old), i)
-    return value
-
-
-def _borrow(typing_context: Any, value: Any) -> Any:
-    """Type and code of ``borrowed``."""
-    del typing_context
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _without_owner(context, builder, signature.return_type, arguments[0])
-
-    return value(value), generate
-
-
-borrowed: Callable[[_T], _T] = cast("Any", intrinsic(_borrow))
-"""For compiled code: an array, or a tuple of arrays, without reference counting; the caller must keep it alive.
-
-Numba counts a reference for each array passed to a function, with an atomic operation; in a function that is called
-for every simulated state these take more time than the work itself.
-"""
