@@ -8,23 +8,24 @@ import gc
 
 _collecting = gc.isenabled()
 gc.disable()  # collecting takes a fifth of the time of these imports, and they leave no garbage
-
-import mbagent_envs
-from mbagent import moved, wrappers
-from mbagent.agent import ModelLearningAgent
-from mbagent.data import TransitionBatch, TransitionDataset
-from mbagent.explain import Explanation, Future, Step
-from mbagent.learned_env import LearnedEnv
-from mbagent.planning.planner import PlannerSettings
-from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
-from mbagent.rewards import RewardFn
-from mbagent.spaces import ActionEnumeration, FactoredSpace
+try:
+    import mbagent_envs
+    from mbagent import moved, wrappers
+    from mbagent.agent import ModelLearningAgent
+    from mbagent.data import TransitionBatch, TransitionDataset
+    from mbagent.explain import Explanation, Future, Step
+    from mbagent.learned_env import LearnedEnv
+    from mbagent.planning.planner import PlannerSettings
+    from mbagent.policies import FlatMonteCarloPolicy, MctsPolicy, PlannerPolicy, ValueIterationPolicy
+    from mbagent.rewards import RewardFn
+    from mbagent.spaces import ActionEnumeration, FactoredSpace
+finally:
+    if _collecting:
+        gc.enable()
 
 __version__ = "0.1.0"
 
 moved.install()
-if _collecting:
-    gc.enable()
 
 __all__ = [
     "ActionEnumeration",

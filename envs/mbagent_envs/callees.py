@@ -3,7 +3,7 @@
 Numba optimises each function that a compiled function calls, and translates it to machine code, in case Python calls it, too.
 Then it optimises and translates the same code again inside the caller, and inside the caller's callers. Here, a function that is
 called by compiled code is only lowered to LLVM's language; a function that Python calls is optimised and translated together with
-everything that it calls. This halves the time of compiling.
+everything that it calls. This saves a quarter to a half of the time of compiling.
 """
 
 from __future__ import annotations

@@ -100,8 +100,10 @@ class TabularMDP(ExactModel):
         """See the class."""
         n_states, rest = divmod(len(offsets) - 1, n_actions)
         super().__init__((n_states,), n_actions)
-        self.offsets, self.next_states = np.ascontiguousarray(offsets), np.ascontiguousarray(next_states)
-        self.terminated, self.probabilities = np.ascontiguousarray(terminated), np.ascontiguousarray(probabilities)
+        self.offsets = np.ascontiguousarray(offsets, dtype=np.int64)  # compiled code needs these types
+        self.next_states = np.ascontiguousarray(next_states, dtype=np.int64)
+        self.terminated = np.ascontiguousarray(terminated, dtype=np.bool_)
+        self.probabilities = np.ascontiguousarray(probabilities, dtype=np.float64)
         self._start = start
         totals = np.add.reduceat(probabilities, offsets[:-1]) if len(probabilities) else np.zeros(0)
         lengths = {len(next_states), len(terminated), len(probabilities), int(offsets[-1])}
